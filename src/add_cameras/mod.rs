@@ -1,0 +1,1 @@
+//! Adding cameras to the model (paper, section 5).

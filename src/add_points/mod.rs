@@ -1,0 +1,1 @@
+//! Adding points to the model (paper, section 6).

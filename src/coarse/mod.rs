@@ -1,0 +1,1 @@
+//! Coarse model estimation (paper, section 4).

@@ -1,0 +1,1 @@
+//! SIFT features: scale space, detection, orientation, description (paper, section 3).

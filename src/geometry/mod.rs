@@ -1,0 +1,8 @@
+//! Rigid and similar transforms, two-view algebra, triangulation and alignment.
+//!
+//! Frames: a camera looks along +z, x to the right, y down. Poses are `target_from_source`; points `x_in_frame`.
+//! Angles are radians unless a name ends in `_deg`.
+
+mod rigid3;
+
+pub use rigid3::Rigid3;

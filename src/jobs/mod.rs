@@ -1,0 +1,1 @@
+//! Jobs: states, queue, executor, recovery.

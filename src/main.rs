@@ -1,0 +1,3 @@
+//! The `multistage` binary.
+
+fn main() {}

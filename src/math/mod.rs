@@ -1,0 +1,7 @@
+//! Small numerical building blocks without geometry in them.
+
+mod rng;
+mod union_find;
+
+pub use rng::Rng;
+pub use union_find::UnionFind;

@@ -1,0 +1,1 @@
+//! Robust estimation: a loop that knows no geometry, and its estimators.

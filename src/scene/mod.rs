@@ -1,0 +1,11 @@
+//! What the stages pass on: ids, rasters, features, and the reconstruction (cameras, registered images, points, tracks).
+
+mod features;
+mod ids;
+mod raster;
+mod reconstruction;
+
+pub use features::{DESCRIPTOR_LEN, Descriptor, Features, Keypoint};
+pub use ids::{CameraId, ImageId, KeypointIdx, Point3dId};
+pub use raster::{GrayImage, RgbImage};
+pub use reconstruction::{Observation, Point3d, Reconstruction, RegisteredImage};

@@ -1,0 +1,1 @@
+//! Minimal and linear solvers, one file each.

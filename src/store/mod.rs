@@ -1,0 +1,1 @@
+//! Durable storage: SQLite tables and the artifact store.

@@ -1,0 +1,1 @@
+//! Synthetic scenes with known truth: for tests, benches, the demo and evaluation; the engine never uses them.
