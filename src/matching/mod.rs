@@ -1,1 +1,6 @@
-//! Descriptor matching and two-view verification.
+//! Descriptor matching: exact nearest neighbours among descriptors, ratio test and cross-check.
+
+pub mod descriptor;
+mod mutual;
+
+pub use mutual::{MatchOptions, RatioTest, match_mutual, match_mutual_packed, mutual_matches};

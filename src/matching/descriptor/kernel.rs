@@ -1,0 +1,252 @@
+//! The scan over tiles, written once for all instruction sets.
+//!
+//! A tile is Q queries by G groups of 16 rows; its Q * G vectors of dot products stay in registers. The rows are walked in
+//! chunks that fit the second-level cache while all queries pass by. For each query three vectors (best, second, number of
+//! the best one's group) run along a chunk and are reduced to a [`Top2`] at its end; for each row, when both directions are
+//! wanted, the same three are kept in memory ([`RowStates`]).
+//!
+//! Ties go to the lowest index: a lane sees its rows in ascending order and changes its mind only for strictly smaller
+//! distances, and the final reduction takes the lowest index among equal lanes.
+
+use super::Top2;
+use super::packed::{GROUP_ROWS, Line, PADDING_BIAS, PackedDescriptors, QUADS, norm_sq};
+use crate::scene::{DESCRIPTOR_LEN, Descriptor};
+
+/// Groups in a chunk: 64 * 2 KiB = 128 KiB of rows.
+const CHUNK_GROUPS: usize = 64;
+
+/// Any distance at or above this belongs to padding.
+const PADDING_LIMIT: i32 = PADDING_BIAS / 2;
+
+/// Sixteen 32-bit lanes and the dot products of queries with groups of rows.
+///
+/// # Safety
+/// The methods may use instructions that the implementing type names; callers make sure that the machine has them.
+pub(super) unsafe trait Kernel {
+    /// Sixteen 32-bit integers.
+    type Lanes: Copy;
+    /// A query in the form its multiplications need.
+    type Query: Copy;
+
+    fn prepare(query: &Descriptor) -> Self::Query;
+
+    /// `(q - o) . v` of every query with every row of the groups.
+    unsafe fn dots<const Q: usize, const G: usize>(
+        queries: &[Self::Query; Q],
+        groups: &[[Line; QUADS]; G],
+    ) -> [[Self::Lanes; G]; Q];
+
+    unsafe fn splat(value: i32) -> Self::Lanes;
+    unsafe fn load(from: &[i32; GROUP_ROWS]) -> Self::Lanes;
+    unsafe fn store(lanes: Self::Lanes, to: &mut [i32; GROUP_ROWS]);
+    /// `a - 2 b`.
+    unsafe fn minus_twice(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
+    unsafe fn add(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
+    unsafe fn min(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
+    unsafe fn max(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
+    /// In every lane `a < b ? if_less : otherwise`.
+    unsafe fn select_less(a: Self::Lanes, b: Self::Lanes, if_less: Self::Lanes, otherwise: Self::Lanes) -> Self::Lanes;
+}
+
+/// Best and second-best squared distance and the best query of every row seen so far.
+struct RowStates {
+    best: Vec<[i32; GROUP_ROWS]>,
+    second: Vec<[i32; GROUP_ROWS]>,
+    query: Vec<[i32; GROUP_ROWS]>,
+}
+
+/// Nearest rows of every query.
+///
+/// # Safety
+/// The machine must have the instructions of `K`.
+#[inline(always)]
+pub(super) unsafe fn top2<K: Kernel, const Q: usize, const G: usize>(
+    queries: &[Descriptor],
+    packed: &PackedDescriptors,
+    out: &mut Vec<Top2>,
+) {
+    // SAFETY: passed on to the caller.
+    unsafe { scan::<K, Q, G>(queries, packed, out, None) };
+}
+
+/// Nearest rows of every query and nearest queries of every row.
+///
+/// # Safety
+/// The machine must have the instructions of `K`.
+#[inline(always)]
+pub(super) unsafe fn top2_both<K: Kernel, const Q: usize, const G: usize>(
+    queries: &[Descriptor],
+    packed: &PackedDescriptors,
+    of_queries: &mut Vec<Top2>,
+    of_rows: &mut Vec<Top2>,
+) {
+    let num_groups = packed.num_groups();
+    let mut rows = RowStates {
+        best: vec![[PADDING_BIAS; GROUP_ROWS]; num_groups],
+        second: vec![[PADDING_BIAS; GROUP_ROWS]; num_groups],
+        query: vec![[0; GROUP_ROWS]; num_groups],
+    };
+    // SAFETY: passed on to the caller.
+    unsafe { scan::<K, Q, G>(queries, packed, of_queries, Some(&mut rows)) };
+    of_rows.clear();
+    if queries.is_empty() {
+        return;
+    }
+    let best = rows.best.as_flattened();
+    let (second, query) = (rows.second.as_flattened(), rows.query.as_flattened());
+    of_rows.extend((0..packed.len()).map(|row| Top2 {
+        index: query[row] as u32,
+        distance_sq: best[row] as u32,
+        second_distance_sq: (second[row] < PADDING_LIMIT).then_some(second[row] as u32),
+    }));
+}
+
+#[inline(always)]
+unsafe fn scan<K: Kernel, const Q: usize, const G: usize>(
+    queries: &[Descriptor],
+    packed: &PackedDescriptors,
+    out: &mut Vec<Top2>,
+    mut rows: Option<&mut RowStates>,
+) {
+    const EMPTY: Descriptor = [0; DESCRIPTOR_LEN];
+    out.clear();
+    let num_groups = packed.num_groups();
+    for chunk in (0..num_groups).step_by(CHUNK_GROUPS) {
+        let chunk_end = (chunk + CHUNK_GROUPS).min(num_groups);
+        for first in (0..queries.len()).step_by(Q) {
+            let used = (queries.len() - first).min(Q);
+            let prepared = std::array::from_fn(|q| K::prepare(if q < used { &queries[first + q] } else { &EMPTY }));
+            // A query that only fills up the tile is farther from every row than any real one.
+            let norms_sq: [i32; Q] =
+                std::array::from_fn(|q| if q < used { norm_sq(&queries[first + q]) } else { PADDING_BIAS });
+            // SAFETY: passed on to the caller.
+            let found = unsafe {
+                scan_block::<K, Q, G>(&prepared, &norms_sq, first, packed, chunk..chunk_end, rows.as_deref_mut())
+            };
+            for (q, found) in found.into_iter().take(used).enumerate() {
+                match out.get_mut(first + q) {
+                    Some(before) => *before = merge(*before, found),
+                    None => out.push(found),
+                }
+            }
+        }
+    }
+}
+
+/// The nearest of two disjoint sets, of which the first has the lower indices.
+fn merge(before: Top2, after: Top2) -> Top2 {
+    let (best, other) = if after.distance_sq < before.distance_sq { (after, before) } else { (before, after) };
+    let runner_up = best.second_distance_sq.map_or(other.distance_sq, |second| second.min(other.distance_sq));
+    Top2 { second_distance_sq: Some(runner_up), ..best }
+}
+
+/// Vectors that run along a chunk for one query.
+#[derive(Clone, Copy)]
+struct Running<L> {
+    best: L,
+    second: L,
+    group: L,
+}
+
+#[inline(always)]
+unsafe fn scan_block<K: Kernel, const Q: usize, const G: usize>(
+    prepared: &[K::Query; Q],
+    norms_sq: &[i32; Q],
+    first_query: usize,
+    packed: &PackedDescriptors,
+    groups: std::ops::Range<usize>,
+    mut rows: Option<&mut RowStates>,
+) -> [Top2; Q] {
+    let (lines, _) = packed.lines.as_chunks::<QUADS>();
+    let (biases, _) = packed.biases.as_chunks::<GROUP_ROWS>();
+    // SAFETY: the caller vouches for the instructions of `K`; everything else is safe.
+    unsafe {
+        let padding = K::splat(PADDING_BIAS);
+        let mut running = [Running { best: padding, second: padding, group: K::splat(0) }; Q];
+        let (tiles, rest) = lines[groups.clone()].as_chunks::<G>();
+        let mut at = groups.start;
+        for tile in tiles {
+            let dots = K::dots::<Q, G>(prepared, tile);
+            for g in 0..G {
+                let column = std::array::from_fn(|q| dots[q][g]);
+                update::<K, Q>(&column, norms_sq, first_query, &biases[at], at, &mut running, rows.as_deref_mut());
+                at += 1;
+            }
+        }
+        for group in rest {
+            let dots = K::dots::<Q, 1>(prepared, std::array::from_ref(group));
+            let column = std::array::from_fn(|q| dots[q][0]);
+            update::<K, Q>(&column, norms_sq, first_query, &biases[at], at, &mut running, rows.as_deref_mut());
+            at += 1;
+        }
+        std::array::from_fn(|q| reduce::<K>(&running[q]))
+    }
+}
+
+/// Folds the dot products of Q queries with one group into the running states.
+#[inline(always)]
+unsafe fn update<K: Kernel, const Q: usize>(
+    dots: &[K::Lanes; Q],
+    norms_sq: &[i32; Q],
+    first_query: usize,
+    biases: &[i32; GROUP_ROWS],
+    group: usize,
+    running: &mut [Running<K::Lanes>; Q],
+    rows: Option<&mut RowStates>,
+) {
+    // SAFETY: the caller vouches for the instructions of `K`.
+    unsafe {
+        let biases = K::load(biases);
+        let group_number = K::splat(group as i32);
+        let mut distances = [biases; Q];
+        for q in 0..Q {
+            let distance = K::add(K::minus_twice(biases, dots[q]), K::splat(norms_sq[q]));
+            let state = &mut running[q];
+            state.group = K::select_less(distance, state.best, group_number, state.group);
+            state.second = K::min(state.second, K::max(state.best, distance));
+            state.best = K::min(state.best, distance);
+            distances[q] = distance;
+        }
+        let Some(rows) = rows else { return };
+        let mut best = K::load(&rows.best[group]);
+        let mut second = K::load(&rows.second[group]);
+        let mut query = K::load(&rows.query[group]);
+        for (q, &distance) in distances.iter().enumerate() {
+            query = K::select_less(distance, best, K::splat((first_query + q) as i32), query);
+            second = K::min(second, K::max(best, distance));
+            best = K::min(best, distance);
+        }
+        K::store(best, &mut rows.best[group]);
+        K::store(second, &mut rows.second[group]);
+        K::store(query, &mut rows.query[group]);
+    }
+}
+
+/// The best and second best over the sixteen lanes.
+#[inline(always)]
+unsafe fn reduce<K: Kernel>(running: &Running<K::Lanes>) -> Top2 {
+    let (mut best, mut second, mut group) = ([0; GROUP_ROWS], [0; GROUP_ROWS], [0; GROUP_ROWS]);
+    // SAFETY: the caller vouches for the instructions of `K`.
+    unsafe {
+        K::store(running.best, &mut best);
+        K::store(running.second, &mut second);
+        K::store(running.group, &mut group);
+    }
+    let nearest = best.iter().copied().fold(i32::MAX, i32::min);
+    let mut index = i32::MAX;
+    for lane in 0..GROUP_ROWS {
+        let row = group[lane] * GROUP_ROWS as i32 + lane as i32;
+        index = index.min(if best[lane] == nearest { row } else { i32::MAX });
+    }
+    let winner = index as usize % GROUP_ROWS;
+    // In the winner's lane its own second takes the place of the best.
+    let mut runner_up = second[winner];
+    for lane in 0..GROUP_ROWS {
+        runner_up = runner_up.min(if lane == winner { i32::MAX } else { best[lane] });
+    }
+    Top2 {
+        index: index as u32,
+        distance_sq: nearest as u32,
+        second_distance_sq: (runner_up < PADDING_LIMIT).then_some(runner_up as u32),
+    }
+}

@@ -1,0 +1,112 @@
+//! The database side of the kernels.
+
+use crate::scene::{DESCRIPTOR_LEN, Descriptor};
+
+/// Rows side by side in a group: the 32-bit lanes of the widest vector.
+pub(super) const GROUP_ROWS: usize = 16;
+/// Quads (runs of four bytes) in a descriptor.
+pub(super) const QUADS: usize = DESCRIPTOR_LEN / 4;
+/// o of the module's formula.
+pub(super) const QUERY_OFFSET: u8 = if cfg!(target_arch = "aarch64") { 0 } else { 128 };
+/// Bias of the rows that only fill up the last group: larger than any squared distance (128 * 255^2 < 2^24), and two of
+/// them still add without overflow.
+pub(super) const PADDING_BIAS: i32 = 1 << 29;
+
+/// One quad of each of the sixteen rows of a group: a cache line.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+pub(super) struct Line(pub(super) [[u8; 4]; GROUP_ROWS]);
+
+/// Descriptors laid out for the kernels: groups of 16 rows; in a group 32 lines, one for each run of four bytes; in a line
+/// these four bytes of each of the 16 rows.
+///
+/// The memory is kept when the set is packed again, so thousands of small sets cost no allocation.
+#[derive(Clone, Debug, Default)]
+pub struct PackedDescriptors {
+    pub(super) lines: Vec<Line>,
+    /// For every row, padding included, the bias of the module's formula.
+    pub(super) biases: Vec<i32>,
+    len: usize,
+}
+
+impl PackedDescriptors {
+    /// An empty set.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Packs all of `descriptors`, in order.
+    pub fn pack(descriptors: &[Descriptor]) -> Self {
+        let mut packed = Self::new();
+        packed.repack(descriptors);
+        packed
+    }
+
+    /// Packs `descriptors[indices[0]], descriptors[indices[1]], ...`: row r is the descriptor `indices[r]`.
+    ///
+    /// # Panics
+    /// When an index is out of range.
+    pub fn pack_subset(descriptors: &[Descriptor], indices: &[u32]) -> Self {
+        let mut packed = Self::new();
+        packed.repack_subset(descriptors, indices);
+        packed
+    }
+
+    /// [`PackedDescriptors::pack`] into this set's memory, replacing what it held.
+    pub fn repack(&mut self, descriptors: &[Descriptor]) {
+        self.fill(descriptors.len(), |row| &descriptors[row]);
+    }
+
+    /// [`PackedDescriptors::pack_subset`] into this set's memory, replacing what it held.
+    ///
+    /// # Panics
+    /// When an index is out of range.
+    pub fn repack_subset(&mut self, descriptors: &[Descriptor], indices: &[u32]) {
+        self.fill(indices.len(), |row| &descriptors[indices[row] as usize]);
+    }
+
+    /// Number of rows.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there is no row.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Number of groups, the last one possibly padded.
+    pub(super) fn num_groups(&self) -> usize {
+        self.biases.len() / GROUP_ROWS
+    }
+
+    fn fill<'a>(&mut self, len: usize, descriptor: impl Fn(usize) -> &'a Descriptor) {
+        const EMPTY: Descriptor = [0; DESCRIPTOR_LEN];
+        self.len = len;
+        self.lines.clear();
+        self.biases.clear();
+        for first in (0..len).step_by(GROUP_ROWS) {
+            let rows: [&Descriptor; GROUP_ROWS] =
+                std::array::from_fn(|lane| if first + lane < len { descriptor(first + lane) } else { &EMPTY });
+            for quad in 0..QUADS {
+                let at = 4 * quad;
+                self.lines.push(Line(rows.map(|row| [row[at], row[at + 1], row[at + 2], row[at + 3]])));
+            }
+            let used = (len - first).min(GROUP_ROWS);
+            self.biases.extend(rows[..used].iter().map(|row| bias(row)));
+            self.biases.extend(std::iter::repeat_n(PADDING_BIAS, GROUP_ROWS - used));
+        }
+    }
+}
+
+/// Squared length of a descriptor.
+#[inline(always)]
+pub(super) fn norm_sq(descriptor: &Descriptor) -> i32 {
+    descriptor.iter().map(|&byte| i32::from(byte) * i32::from(byte)).sum()
+}
+
+#[inline(always)]
+fn bias(row: &Descriptor) -> i32 {
+    let sum: i32 = row.iter().map(|&byte| i32::from(byte)).sum();
+    norm_sq(row) - 2 * i32::from(QUERY_OFFSET) * sum
+}

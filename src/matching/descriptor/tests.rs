@@ -1,0 +1,82 @@
+use super::*;
+use crate::math::Rng;
+use crate::scene::DESCRIPTOR_LEN;
+
+/// Half of the bytes full-range at random, sometimes all 0 or all 255, and now and then a repeat, so that ties occur.
+fn descriptors(rng: &mut Rng, n: usize) -> Vec<Descriptor> {
+    let mut all: Vec<Descriptor> = Vec::with_capacity(n);
+    for _ in 0..n {
+        let next = match rng.below(8) {
+            0 => [0; DESCRIPTOR_LEN],
+            1 => [255; DESCRIPTOR_LEN],
+            2 if !all.is_empty() => all[rng.below(all.len())],
+            3 => std::array::from_fn(|_| if rng.below(2) == 0 { 0 } else { 255 }),
+            _ => std::array::from_fn(|_| rng.below(256) as u8),
+        };
+        all.push(next);
+    }
+    all
+}
+
+/// The definition, without any layout.
+fn brute_force(queries: &[Descriptor], rows: &[Descriptor]) -> Vec<Top2> {
+    let nearest = |query: &Descriptor| {
+        let mut ranked: Vec<(u32, u32)> = (0u32..).zip(rows).map(|(i, row)| (distance_sq(query, row), i)).collect();
+        ranked.sort_unstable();
+        let &(distance_sq, index) = ranked.first()?;
+        Some(Top2 { index, distance_sq, second_distance_sq: ranked.get(1).map(|second| second.0) })
+    };
+    queries.iter().filter_map(nearest).collect()
+}
+
+#[test]
+fn every_tier_agrees_with_the_definition() {
+    let mut rng = Rng::from_parts(&[1]);
+    for (num_queries, num_rows) in
+        [(1, 1), (1, 2), (7, 15), (6, 16), (13, 17), (10, 80), (23, 33), (40, 2100), (0, 5), (5, 0)]
+    {
+        let queries = descriptors(&mut rng, num_queries);
+        let rows = descriptors(&mut rng, num_rows);
+        let packed = PackedDescriptors::pack(&rows);
+        let expected = brute_force(&queries, &rows);
+        let expected_of_rows = brute_force(&rows, &queries);
+        for &tier in Tier::ALL.iter().filter(|tier| tier.is_available()) {
+            let (mut out, mut of_rows) = (Vec::new(), Vec::new());
+            tier.top2(&queries, &packed, &mut out);
+            assert_eq!(out, expected, "{tier:?} {num_queries} {num_rows}");
+            tier.top2_both(&queries, &packed, &mut out, &mut of_rows);
+            assert_eq!(out, expected, "{tier:?} {num_queries} {num_rows}");
+            assert_eq!(of_rows, expected_of_rows, "{tier:?} {num_queries} {num_rows}");
+        }
+    }
+}
+
+#[test]
+fn the_largest_distance_does_not_overflow() {
+    let (black, white) = ([0; DESCRIPTOR_LEN], [255; DESCRIPTOR_LEN]);
+    for (query, row) in [(black, white), (white, black)] {
+        for &tier in Tier::ALL.iter().filter(|tier| tier.is_available()) {
+            let mut out = Vec::new();
+            tier.top2(&[query], &PackedDescriptors::pack(&[row]), &mut out);
+            assert_eq!(out, [Top2 { index: 0, distance_sq: 128 * 255 * 255, second_distance_sq: None }]);
+        }
+    }
+}
+
+#[test]
+fn a_subset_is_numbered_by_its_list_and_memory_is_reused() {
+    let mut rng = Rng::from_parts(&[2]);
+    let rows = descriptors(&mut rng, 300);
+    let queries = descriptors(&mut rng, 9);
+    let mut packed = PackedDescriptors::pack(&rows);
+    for subset in [vec![299, 0, 17, 17, 5], (0..100).rev().collect(), vec![3]] {
+        packed.repack_subset(&rows, &subset);
+        assert_eq!(packed.len(), subset.len());
+        let chosen: Vec<Descriptor> = subset.iter().map(|&i| rows[i as usize]).collect();
+        let mut out = vec![Top2 { index: 9, distance_sq: 9, second_distance_sq: None }];
+        top2(&queries, &packed, &mut out);
+        assert_eq!(out, brute_force(&queries, &chosen));
+        top2(&queries, &PackedDescriptors::pack_subset(&rows, &subset), &mut out);
+        assert_eq!(out, brute_force(&queries, &chosen));
+    }
+}

@@ -1,0 +1,154 @@
+//! Which instructions to use, asked of the machine once.
+
+use std::sync::LazyLock;
+
+use super::scalar::Scalar;
+use super::{PackedDescriptors, Top2, kernel};
+use crate::scene::Descriptor;
+
+/// A set of instructions a kernel is written for. All give identical results.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Tier {
+    /// The target's baseline.
+    Scalar,
+    /// 256-bit integers with 16-bit products.
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    /// 256-bit byte dot products.
+    #[cfg(target_arch = "x86_64")]
+    AvxVnni,
+    /// 512-bit byte dot products.
+    #[cfg(target_arch = "x86_64")]
+    Avx512Vnni,
+    /// 128-bit integers with 16-bit products.
+    #[cfg(target_arch = "aarch64")]
+    Neon,
+}
+
+impl Tier {
+    /// Every tier this program was built with, slowest first.
+    pub const ALL: &[Self] = &[
+        Self::Scalar,
+        #[cfg(target_arch = "x86_64")]
+        Self::Avx2,
+        #[cfg(target_arch = "x86_64")]
+        Self::AvxVnni,
+        #[cfg(target_arch = "x86_64")]
+        Self::Avx512Vnni,
+        #[cfg(target_arch = "aarch64")]
+        Self::Neon,
+    ];
+
+    /// The fastest tier of this machine.
+    pub fn detected() -> Self {
+        static DETECTED: LazyLock<Tier> =
+            LazyLock::new(|| Tier::ALL.iter().copied().rev().find(|tier| tier.is_available()).unwrap_or(Tier::Scalar));
+        *DETECTED
+    }
+
+    /// Whether this machine has the instructions.
+    pub fn is_available(self) -> bool {
+        match self {
+            Self::Scalar => true,
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => std::is_x86_feature_detected!("avx2"),
+            #[cfg(target_arch = "x86_64")]
+            Self::AvxVnni => std::is_x86_feature_detected!("avx2") && std::is_x86_feature_detected!("avxvnni"),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Vnni => {
+                std::is_x86_feature_detected!("avx512f")
+                    && std::is_x86_feature_detected!("avx512bw")
+                    && std::is_x86_feature_detected!("avx512vnni")
+            }
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => true,
+        }
+    }
+
+    /// [`super::top2`] with these instructions.
+    ///
+    /// # Panics
+    /// When the machine lacks them.
+    pub fn top2(self, queries: &[Descriptor], packed: &PackedDescriptors, out: &mut Vec<Top2>) {
+        self.assert_available();
+        // SAFETY: the instructions are there.
+        unsafe {
+            match self {
+                Self::Scalar => kernel::top2::<Scalar, 4, 1>(queries, packed, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx2 => x86::top2_avx2(queries, packed, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::AvxVnni => x86::top2_avx_vnni(queries, packed, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Vnni => x86::top2_avx512_vnni(queries, packed, out),
+                #[cfg(target_arch = "aarch64")]
+                Self::Neon => kernel::top2::<super::neon::Neon, 6, 1>(queries, packed, out),
+            }
+        }
+    }
+
+    /// [`super::top2_both`] with these instructions.
+    ///
+    /// # Panics
+    /// When the machine lacks them.
+    pub fn top2_both(
+        self,
+        queries: &[Descriptor],
+        packed: &PackedDescriptors,
+        of_queries: &mut Vec<Top2>,
+        of_rows: &mut Vec<Top2>,
+    ) {
+        self.assert_available();
+        // SAFETY: the instructions are there.
+        unsafe {
+            match self {
+                Self::Scalar => kernel::top2_both::<Scalar, 4, 1>(queries, packed, of_queries, of_rows),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx2 => x86::top2_both_avx2(queries, packed, of_queries, of_rows),
+                #[cfg(target_arch = "x86_64")]
+                Self::AvxVnni => x86::top2_both_avx_vnni(queries, packed, of_queries, of_rows),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Vnni => x86::top2_both_avx512_vnni(queries, packed, of_queries, of_rows),
+                #[cfg(target_arch = "aarch64")]
+                Self::Neon => kernel::top2_both::<super::neon::Neon, 6, 1>(queries, packed, of_queries, of_rows),
+            }
+        }
+    }
+
+    fn assert_available(self) {
+        assert!(self <= Self::detected() || self.is_available(), "this machine has no {self:?} instructions");
+    }
+}
+
+/// The generic scan compiled for each set of instructions, with the tile that fits its registers.
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use super::super::x86::{Avx2, Avx512Vnni, AvxVnni};
+    use super::super::{PackedDescriptors, Top2, kernel};
+    use crate::scene::Descriptor;
+
+    macro_rules! compile {
+        ($features:literal, $kernel:ty, $queries:literal, $groups:literal, $one_way:ident, $both_ways:ident) => {
+            #[target_feature(enable = $features)]
+            pub(super) fn $one_way(queries: &[Descriptor], packed: &PackedDescriptors, out: &mut Vec<Top2>) {
+                // SAFETY: this function is only called on machines that have its features.
+                unsafe { kernel::top2::<$kernel, $queries, $groups>(queries, packed, out) }
+            }
+
+            #[target_feature(enable = $features)]
+            pub(super) fn $both_ways(
+                queries: &[Descriptor],
+                packed: &PackedDescriptors,
+                of_queries: &mut Vec<Top2>,
+                of_rows: &mut Vec<Top2>,
+            ) {
+                // SAFETY: this function is only called on machines that have its features.
+                unsafe { kernel::top2_both::<$kernel, $queries, $groups>(queries, packed, of_queries, of_rows) }
+            }
+        };
+    }
+
+    compile!("avx2", Avx2, 4, 1, top2_avx2, top2_both_avx2);
+    compile!("avx2,avxvnni", AvxVnni, 5, 1, top2_avx_vnni, top2_both_avx_vnni);
+    compile!("avx512f,avx512bw,avx512vnni", Avx512Vnni, 6, 2, top2_avx512_vnni, top2_both_avx512_vnni);
+}

@@ -1,0 +1,251 @@
+//! Kernels for x86-64: AVX2, AVX-VNNI (256 bits) and AVX-512 VNNI.
+
+use std::arch::x86_64::*;
+
+use super::kernel::Kernel;
+use super::packed::{GROUP_ROWS, Line, QUADS, QUERY_OFFSET};
+use crate::scene::Descriptor;
+
+/// The query's bytes as signed ones, four to an integer that is broadcast to all rows.
+#[inline(always)]
+fn signed_quads(query: &Descriptor) -> [i32; QUADS] {
+    std::array::from_fn(|quad| i32::from_le_bytes(std::array::from_fn(|byte| query[4 * quad + byte] ^ QUERY_OFFSET)))
+}
+
+/// 512-bit `vpdpbusd`.
+pub(super) struct Avx512Vnni;
+
+// SAFETY: needs AVX-512 F, BW and VNNI, which `tier` asks for before it chooses this kernel.
+unsafe impl Kernel for Avx512Vnni {
+    type Lanes = __m512i;
+    type Query = [i32; QUADS];
+
+    #[inline(always)]
+    fn prepare(query: &Descriptor) -> Self::Query {
+        signed_quads(query)
+    }
+
+    #[inline(always)]
+    unsafe fn dots<const Q: usize, const G: usize>(
+        queries: &[Self::Query; Q],
+        groups: &[[Line; QUADS]; G],
+    ) -> [[Self::Lanes; G]; Q] {
+        // SAFETY: a line is 64 aligned bytes; the instructions are the caller's matter.
+        unsafe {
+            let mut sums = [[_mm512_setzero_si512(); G]; Q];
+            for quad in 0..QUADS {
+                let rows: [__m512i; G] =
+                    std::array::from_fn(|g| _mm512_load_si512((&raw const groups[g][quad]).cast()));
+                for q in 0..Q {
+                    let query = _mm512_set1_epi32(queries[q][quad]);
+                    for g in 0..G {
+                        sums[q][g] = _mm512_dpbusd_epi32(sums[q][g], rows[g], query);
+                    }
+                }
+            }
+            sums
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn splat(value: i32) -> Self::Lanes {
+        // SAFETY: the instructions are the caller's matter.
+        unsafe { _mm512_set1_epi32(value) }
+    }
+
+    #[inline(always)]
+    unsafe fn load(from: &[i32; GROUP_ROWS]) -> Self::Lanes {
+        // SAFETY: 64 bytes are there; the instructions are the caller's matter.
+        unsafe { _mm512_loadu_si512(from.as_ptr().cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn store(lanes: Self::Lanes, to: &mut [i32; GROUP_ROWS]) {
+        // SAFETY: 64 bytes are there; the instructions are the caller's matter.
+        unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), lanes) }
+    }
+
+    #[inline(always)]
+    unsafe fn minus_twice(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes {
+        // SAFETY: the instructions are the caller's matter.
+        unsafe { _mm512_sub_epi32(a, _mm512_slli_epi32::<1>(b)) }
+    }
+
+    #[inline(always)]
+    unsafe fn add(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes {
+        // SAFETY: the instructions are the caller's matter.
+        unsafe { _mm512_add_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn min(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes {
+        // SAFETY: the instructions are the caller's matter.
+        unsafe { _mm512_min_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn max(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes {
+        // SAFETY: the instructions are the caller's matter.
+        unsafe { _mm512_max_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn select_less(a: Self::Lanes, b: Self::Lanes, if_less: Self::Lanes, otherwise: Self::Lanes) -> Self::Lanes {
+        // SAFETY: the instructions are the caller's matter.
+        unsafe { _mm512_mask_mov_epi32(otherwise, _mm512_cmplt_epi32_mask(a, b), if_less) }
+    }
+}
+
+/// What the two kernels with 256-bit vectors share: sixteen lanes are two vectors.
+macro_rules! halves {
+    () => {
+        #[inline(always)]
+        unsafe fn splat(value: i32) -> Self::Lanes {
+            // SAFETY: the instructions are the caller's matter.
+            unsafe { [_mm256_set1_epi32(value); 2] }
+        }
+
+        #[inline(always)]
+        unsafe fn load(from: &[i32; GROUP_ROWS]) -> Self::Lanes {
+            // SAFETY: twice 32 bytes are there; the instructions are the caller's matter.
+            unsafe { [_mm256_loadu_si256(from.as_ptr().cast()), _mm256_loadu_si256(from.as_ptr().add(8).cast())] }
+        }
+
+        #[inline(always)]
+        unsafe fn store(lanes: Self::Lanes, to: &mut [i32; GROUP_ROWS]) {
+            // SAFETY: twice 32 bytes are there; the instructions are the caller's matter.
+            unsafe {
+                _mm256_storeu_si256(to.as_mut_ptr().cast(), lanes[0]);
+                _mm256_storeu_si256(to.as_mut_ptr().add(8).cast(), lanes[1]);
+            }
+        }
+
+        #[inline(always)]
+        unsafe fn minus_twice(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes {
+            // SAFETY: the instructions are the caller's matter.
+            unsafe { std::array::from_fn(|h| _mm256_sub_epi32(a[h], _mm256_slli_epi32::<1>(b[h]))) }
+        }
+
+        #[inline(always)]
+        unsafe fn add(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes {
+            // SAFETY: the instructions are the caller's matter.
+            unsafe { std::array::from_fn(|h| _mm256_add_epi32(a[h], b[h])) }
+        }
+
+        #[inline(always)]
+        unsafe fn min(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes {
+            // SAFETY: the instructions are the caller's matter.
+            unsafe { std::array::from_fn(|h| _mm256_min_epi32(a[h], b[h])) }
+        }
+
+        #[inline(always)]
+        unsafe fn max(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes {
+            // SAFETY: the instructions are the caller's matter.
+            unsafe { std::array::from_fn(|h| _mm256_max_epi32(a[h], b[h])) }
+        }
+
+        #[inline(always)]
+        unsafe fn select_less(
+            a: Self::Lanes,
+            b: Self::Lanes,
+            if_less: Self::Lanes,
+            otherwise: Self::Lanes,
+        ) -> Self::Lanes {
+            // SAFETY: the instructions are the caller's matter.
+            unsafe {
+                std::array::from_fn(|h| _mm256_blendv_epi8(otherwise[h], if_less[h], _mm256_cmpgt_epi32(b[h], a[h])))
+            }
+        }
+    };
+}
+
+/// 256-bit `vpdpbusd` in its VEX form.
+pub(super) struct AvxVnni;
+
+// SAFETY: needs AVX2 and AVX-VNNI, which `tier` asks for before it chooses this kernel.
+unsafe impl Kernel for AvxVnni {
+    type Lanes = [__m256i; 2];
+    type Query = [i32; QUADS];
+
+    #[inline(always)]
+    fn prepare(query: &Descriptor) -> Self::Query {
+        signed_quads(query)
+    }
+
+    #[inline(always)]
+    unsafe fn dots<const Q: usize, const G: usize>(
+        queries: &[Self::Query; Q],
+        groups: &[[Line; QUADS]; G],
+    ) -> [[Self::Lanes; G]; Q] {
+        // SAFETY: a line is twice 32 aligned bytes; the instructions are the caller's matter.
+        unsafe {
+            let mut sums = [[[_mm256_setzero_si256(); 2]; G]; Q];
+            for quad in 0..QUADS {
+                for g in 0..G {
+                    let line: *const __m256i = (&raw const groups[g][quad]).cast();
+                    let rows = [_mm256_load_si256(line), _mm256_load_si256(line.add(1))];
+                    for q in 0..Q {
+                        let query = _mm256_set1_epi32(queries[q][quad]);
+                        for h in 0..2 {
+                            sums[q][g][h] = _mm256_dpbusd_avx_epi32(sums[q][g][h], rows[h], query);
+                        }
+                    }
+                }
+            }
+            sums
+        }
+    }
+
+    halves!();
+}
+
+/// AVX2 alone. `vpmaddubsw` would saturate for full-range bytes, so a line is split into its even and its odd bytes, as
+/// 16-bit numbers, and each half multiplied and added up in pairs (`vpmaddwd`): still one 32-bit sum per row.
+pub(super) struct Avx2;
+
+// SAFETY: needs AVX2, which `tier` asks for before it chooses this kernel.
+unsafe impl Kernel for Avx2 {
+    type Lanes = [__m256i; 2];
+    /// For every quad its even bytes and its odd bytes, two 16-bit numbers to an integer.
+    type Query = [[i32; 2]; QUADS];
+
+    #[inline(always)]
+    fn prepare(query: &Descriptor) -> Self::Query {
+        let signed = |at: usize| i32::from(query[at]) - i32::from(QUERY_OFFSET);
+        let pair = |low: usize| (signed(low) & 0xffff) | (signed(low + 2) << 16);
+        std::array::from_fn(|quad| [pair(4 * quad), pair(4 * quad + 1)])
+    }
+
+    #[inline(always)]
+    unsafe fn dots<const Q: usize, const G: usize>(
+        queries: &[Self::Query; Q],
+        groups: &[[Line; QUADS]; G],
+    ) -> [[Self::Lanes; G]; Q] {
+        // SAFETY: a line is twice 32 aligned bytes; the instructions are the caller's matter.
+        unsafe {
+            let even_bytes = _mm256_set1_epi16(0xff);
+            let mut sums = [[[_mm256_setzero_si256(); 2]; G]; Q];
+            for quad in 0..QUADS {
+                for g in 0..G {
+                    let line: *const __m256i = (&raw const groups[g][quad]).cast();
+                    let rows = [_mm256_load_si256(line), _mm256_load_si256(line.add(1))];
+                    let even: [__m256i; 2] = std::array::from_fn(|h| _mm256_and_si256(rows[h], even_bytes));
+                    let odd: [__m256i; 2] = std::array::from_fn(|h| _mm256_srli_epi16::<8>(rows[h]));
+                    for q in 0..Q {
+                        let [query_even, query_odd] = queries[q][quad].map(|pair| _mm256_set1_epi32(pair));
+                        for h in 0..2 {
+                            let products = _mm256_add_epi32(
+                                _mm256_madd_epi16(even[h], query_even),
+                                _mm256_madd_epi16(odd[h], query_odd),
+                            );
+                            sums[q][g][h] = _mm256_add_epi32(sums[q][g][h], products);
+                        }
+                    }
+                }
+            }
+            sums
+        }
+    }
+
+    halves!();
+}
