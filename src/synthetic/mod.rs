@@ -1,1 +1,9 @@
 //! Synthetic scenes with known truth: for tests, benches, the demo and evaluation; the engine never uses them.
+
+mod compare;
+mod layout;
+mod scene;
+
+pub use compare::{ModelDifference, compare};
+pub use layout::Layout;
+pub use scene::{PairMatches, SceneOptions, SyntheticScene, generate, perturbed};
