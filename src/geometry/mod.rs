@@ -3,6 +3,8 @@
 //! Frames: a camera looks along +z, x to the right, y down. Poses are `target_from_source`; points `x_in_frame`.
 //! Angles are radians unless a name ends in `_deg`.
 
+pub mod epipolar;
 mod rigid3;
+pub mod triangulation;
 
 pub use rigid3::Rigid3;

@@ -1,5 +1,6 @@
 //! Small numerical building blocks without geometry in them.
 
+pub mod polynomial;
 mod rng;
 mod union_find;
 
