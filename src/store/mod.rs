@@ -1,1 +1,72 @@
-//! Durable storage: SQLite tables and the artifact store.
+//! Durable storage: SQLite tables, photographs and outputs as files, and the artifact store.
+
+mod archive;
+mod artifacts;
+pub(crate) mod atomic;
+pub mod db;
+mod file_name;
+mod incoming;
+mod layout;
+
+use std::io;
+use std::path::Path;
+
+pub use archive::{ArchiveError, ArchiveLimits, unpack};
+pub use artifacts::ArtifactStore;
+pub use db::Db;
+pub use file_name::{ImagePath, InvalidFileName};
+pub use incoming::{Committed, StagedFile, StagedWriter};
+pub use layout::DataDir;
+
+/// The database and the files that belong to it.
+#[derive(Debug)]
+pub struct Store {
+    /// Tables.
+    pub db: Db,
+    /// Files.
+    pub data: DataDir,
+}
+
+/// Why the store refused or failed.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// The path is stored with other bytes, or is a folder of another.
+    #[error("{0:?} is stored already with other bytes")]
+    FileConflict(String),
+    /// A job on the dataset is queued or running.
+    #[error("a job uses the dataset")]
+    DatasetInUse,
+    /// There is no such thing.
+    #[error("not found")]
+    NotFound,
+    /// What the system said.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// What SQLite said.
+    #[error("database: {0}")]
+    Db(#[from] sqlx::Error),
+}
+
+impl StoreError {
+    /// Whether the reason is that the disk is full.
+    pub fn is_disk_full(&self) -> bool {
+        match self {
+            Self::Io(error) => matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded),
+            // SQLITE_FULL
+            Self::Db(sqlx::Error::Database(error)) => error.code().as_deref() == Some("13"),
+            _ => false,
+        }
+    }
+}
+
+impl Store {
+    /// Opens a data directory, alone.
+    ///
+    /// # Errors
+    /// What the system or SQLite said; [`io::ErrorKind::WouldBlock`] when another process uses it.
+    pub async fn open(root: &Path) -> Result<Self, StoreError> {
+        let data = DataDir::open(root)?;
+        let db = Db::open(&data.database()).await?;
+        Ok(Self { db, data })
+    }
+}

@@ -1,0 +1,146 @@
+//! Table `jobs`.
+
+use std::collections::BTreeMap;
+
+use sqlx::{FromRow, SqliteConnection, SqliteExecutor};
+use uuid::Uuid;
+
+/// A job.
+#[derive(Clone, Debug, FromRow)]
+pub struct JobRow {
+    /// Its id, a UUID in text.
+    pub id: String,
+    /// Place in the order of making.
+    pub seq: i64,
+    /// For people.
+    pub name: String,
+    /// `queued`, `running`, `succeeded`, `failed` or `cancelled`.
+    pub state: String,
+    /// Whether somebody asked the running job to stop.
+    pub cancel_requested: bool,
+    /// When it was made.
+    pub created_ms: i64,
+    /// When the latest attempt started.
+    pub started_ms: Option<i64>,
+    /// When it came to its end.
+    pub finished_ms: Option<i64>,
+    /// Its photographs.
+    pub dataset_id: String,
+    /// JSON, as given.
+    pub options: String,
+    /// Files of its upload that were no photographs.
+    pub ignored: Option<i64>,
+    /// How often the process ended under it.
+    pub interruptions: i64,
+    /// JSON, null without a report.
+    pub models: Option<String>,
+    /// The stage that failed.
+    pub error_stage: Option<String>,
+    /// Why it failed, for machines.
+    pub error_code: Option<String>,
+    /// Why it failed, for people.
+    pub error_message: Option<String>,
+}
+
+/// What a new job is made of.
+#[derive(Clone, Debug)]
+pub struct NewJobRow {
+    /// Its id.
+    pub id: Uuid,
+    /// For people.
+    pub name: String,
+    /// When it was made.
+    pub created_ms: i64,
+    /// Its photographs.
+    pub dataset: Uuid,
+    /// JSON.
+    pub options: String,
+    /// Files of its upload that were no photographs.
+    pub ignored: Option<i64>,
+}
+
+/// Adds a queued job.
+pub async fn insert(db: &mut SqliteConnection, job: &NewJobRow) -> sqlx::Result<()> {
+    sqlx::query(
+        "INSERT INTO jobs (id, seq, name, state, created_ms, dataset_id, options, ignored)
+         VALUES (?, (SELECT COALESCE(MAX(seq), 0) + 1 FROM jobs), ?, 'queued', ?, ?, ?, ?)",
+    )
+    .bind(job.id.to_string())
+    .bind(&job.name)
+    .bind(job.created_ms)
+    .bind(job.dataset.to_string())
+    .bind(&job.options)
+    .bind(job.ignored)
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// One job.
+pub async fn find(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<Option<JobRow>> {
+    sqlx::query_as("SELECT * FROM jobs WHERE id = ?").bind(id.to_string()).fetch_optional(db).await
+}
+
+/// Jobs older than the one with `seq` `before`, newest first.
+pub async fn list(db: impl SqliteExecutor<'_>, before: i64, limit: u32) -> sqlx::Result<Vec<JobRow>> {
+    sqlx::query_as("SELECT * FROM jobs WHERE seq < ? ORDER BY seq DESC LIMIT ?")
+        .bind(before)
+        .bind(limit)
+        .fetch_all(db)
+        .await
+}
+
+/// The job that has waited longest.
+pub async fn next_queued(db: &mut SqliteConnection) -> sqlx::Result<Option<JobRow>> {
+    sqlx::query_as("SELECT * FROM jobs WHERE state = 'queued' ORDER BY seq LIMIT 1").fetch_optional(db).await
+}
+
+/// Every job in a state.
+pub async fn in_state(db: &mut SqliteConnection, state: &str) -> sqlx::Result<Vec<JobRow>> {
+    sqlx::query_as("SELECT * FROM jobs WHERE state = ? ORDER BY seq").bind(state).fetch_all(db).await
+}
+
+/// Writes the columns that change with the state.
+pub async fn update_state(db: &mut SqliteConnection, job: &JobRow) -> sqlx::Result<()> {
+    sqlx::query(
+        "UPDATE jobs SET state = ?, cancel_requested = ?, started_ms = ?, finished_ms = ?, interruptions = ?, models = ?,
+         error_stage = ?, error_code = ?, error_message = ? WHERE id = ?",
+    )
+    .bind(&job.state)
+    .bind(job.cancel_requested)
+    .bind(job.started_ms)
+    .bind(job.finished_ms)
+    .bind(job.interruptions)
+    .bind(&job.models)
+    .bind(&job.error_stage)
+    .bind(&job.error_code)
+    .bind(&job.error_message)
+    .bind(&job.id)
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Removes a job with all its rows.
+pub async fn delete(db: &mut SqliteConnection, id: Uuid) -> sqlx::Result<()> {
+    sqlx::query("DELETE FROM jobs WHERE id = ?").bind(id.to_string()).execute(db).await?;
+    Ok(())
+}
+
+/// Whether any job refers to a dataset, and whether one of them is queued or running.
+pub async fn use_of_dataset(db: &mut SqliteConnection, dataset: Uuid) -> sqlx::Result<(bool, bool)> {
+    let (all, active): (i64, i64) = sqlx::query_as(
+        "SELECT COUNT(*), COALESCE(SUM(state IN ('queued', 'running')), 0) FROM jobs WHERE dataset_id = ?",
+    )
+    .bind(dataset.to_string())
+    .fetch_one(db)
+    .await?;
+    Ok((all > 0, active > 0))
+}
+
+/// Jobs per state.
+pub async fn count_by_state(db: impl SqliteExecutor<'_>) -> sqlx::Result<BTreeMap<String, i64>> {
+    let rows: Vec<(String, i64)> =
+        sqlx::query_as("SELECT state, COUNT(*) FROM jobs GROUP BY state").fetch_all(db).await?;
+    Ok(rows.into_iter().collect())
+}

@@ -1,0 +1,137 @@
+//! Where things lie in the data directory, and the lock that keeps it to one process.
+//!
+//! ```text
+//! lock                       held by the process that uses the directory
+//! multistage.db              SQLite (with -wal and -shm beside it)
+//! datasets/<id>/images/...   photographs under the names they came with
+//! jobs/<id>/work/...         artifacts of a run, to go on from
+//! jobs/<id>/partial/...      outputs while a run writes them
+//! jobs/<id>/out/...          published outputs
+//! jobs/<id>/thumbnails/...   made on demand
+//! incoming/...               uploads on their way; emptied at start
+//! trash/...                  folders being deleted; emptied at start
+//! ```
+
+use std::fs::{File, TryLockError};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use uuid::Uuid;
+
+use super::atomic;
+
+/// A data directory, locked for this process.
+#[derive(Debug)]
+pub struct DataDir {
+    root: PathBuf,
+    /// Held for its lock alone.
+    _lock: File,
+}
+
+impl DataDir {
+    /// Makes the directory where needed and locks it.
+    ///
+    /// # Errors
+    /// [`io::ErrorKind::WouldBlock`] when another process uses it, else what the system said.
+    pub fn open(root: &Path) -> io::Result<Self> {
+        std::fs::create_dir_all(root)?;
+        let root = root.canonicalize()?;
+        let lock = File::options().create(true).truncate(false).write(true).open(root.join("lock"))?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let message = format!("{} is in use by another process", root.display());
+                return Err(io::Error::new(io::ErrorKind::WouldBlock, message));
+            }
+            Err(TryLockError::Error(error)) => return Err(error),
+        }
+        for folder in ["datasets", "jobs"] {
+            std::fs::create_dir_all(root.join(folder))?;
+        }
+        for folder in ["incoming", "trash"] {
+            atomic::empty_dir(&root.join(folder))?;
+        }
+        atomic::sync_dir(&root)?;
+        Ok(Self { root, _lock: lock })
+    }
+
+    /// The directory itself.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    pub(crate) fn database(&self) -> PathBuf {
+        self.root.join("multistage.db")
+    }
+
+    pub(crate) fn dataset(&self, dataset: Uuid) -> PathBuf {
+        self.root.join("datasets").join(dataset.to_string())
+    }
+
+    /// The photographs of a dataset.
+    pub fn images(&self, dataset: Uuid) -> PathBuf {
+        self.dataset(dataset).join("images")
+    }
+
+    pub(crate) fn job(&self, job: Uuid) -> PathBuf {
+        self.root.join("jobs").join(job.to_string())
+    }
+
+    /// The artifacts of a job.
+    pub fn work(&self, job: Uuid) -> PathBuf {
+        self.job(job).join("work")
+    }
+
+    /// The outputs of a job while the run writes them.
+    pub fn partial(&self, job: Uuid) -> PathBuf {
+        self.job(job).join("partial")
+    }
+
+    /// The published outputs of a job.
+    pub fn out(&self, job: Uuid) -> PathBuf {
+        self.job(job).join("out")
+    }
+
+    /// The thumbnails of a job's photographs.
+    pub fn thumbnails(&self, job: Uuid) -> PathBuf {
+        self.job(job).join("thumbnails")
+    }
+
+    pub(crate) fn incoming(&self) -> PathBuf {
+        self.root.join("incoming")
+    }
+
+    /// Deletes a folder so that it is gone at once, whatever happens while its content is removed; a missing one is no error.
+    pub(crate) fn discard(&self, folder: &Path) -> io::Result<()> {
+        let grave = self.root.join("trash").join(Uuid::now_v7().to_string());
+        match std::fs::rename(folder, &grave) {
+            Ok(()) => {}
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            Err(error) => return Err(error),
+        }
+        atomic::sync_parent(folder)?;
+        std::fs::remove_dir_all(&grave)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn a_directory_serves_one_process_and_forgets_half_uploads() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = DataDir::open(folder.path()).unwrap();
+        assert_eq!(DataDir::open(folder.path()).unwrap_err().kind(), io::ErrorKind::WouldBlock);
+        std::fs::write(data.incoming().join("half"), b"x").unwrap();
+        let job = data.job(Uuid::nil());
+        std::fs::create_dir_all(job.join("work")).unwrap();
+        data.discard(&job).unwrap();
+        data.discard(&job).unwrap();
+        assert!(!job.exists());
+        drop(data);
+        let data = DataDir::open(folder.path()).unwrap();
+        assert!(!data.incoming().join("half").exists());
+    }
+}
