@@ -1,0 +1,266 @@
+//! Matching two images with known poses along epipolar lines (paper, sections 6.2.1 to 6.2.3).
+//!
+//! For every group of queries that share an epipolar line the candidates near the line are gathered once, and each query is
+//! compared with all of them: with about 80 candidates a packed scan of exact distances costs less than the building of
+//! the paper's small k-d trees alone (the authors' program spends a quarter of its time on that).
+//!
+//! The ratio test comes *after* the geometric restriction: look-alikes elsewhere on a facade are not among the candidates,
+//! so they can't reject a match, which is where the method's density comes from. A small candidate set would make the
+//! test meaningless (one candidate has no rival), so it is filled up with random features of the target that compete for
+//! the second place only, as the authors' code does and the print does not say. A rival at the place of the best candidate
+//! is no rival: SIFT describes one place several times.
+//!
+//! The result is a pure function of its arguments: the random features depend on the seed and on the pair.
+
+use std::f64::consts::{PI, TAU};
+
+use super::candidate_search::SeenMarks;
+use super::epipolar::{EpipolarGeometry, EpipolarLine};
+use super::line_groups::group_by_line;
+use super::options::GuidedMatchOptions;
+use super::prepared::PreparedImage;
+use crate::matching::descriptor::{PackedDescriptors, Top2, distance_sq, top2};
+use crate::math::Rng;
+use crate::scene::{Descriptor, ImageId, KeypointIdx};
+
+/// Keypoints that belong together, of the first and of the second image of a pair.
+pub type KeypointMatch = (KeypointIdx, KeypointIdx);
+
+/// Separates this stage's random streams from others'.
+const RANDOM_STREAM: u64 = 0x6164_6470_6f69_6e74;
+
+/// The matches of two images along their epipolar lines, by the first image's keypoints; each keypoint at most once.
+/// `settled` lists keypoint pairs already known to belong together (they see one point of the model): they are not matched
+/// again, nor matched with others, but they compete. No matches when there are fewer than the options' minimum.
+pub fn guided_match(
+    (first_id, first): (ImageId, &PreparedImage),
+    (second_id, second): (ImageId, &PreparedImage),
+    settled: &[KeypointMatch],
+    options: &GuidedMatchOptions,
+    seed: u64,
+) -> Vec<KeypointMatch> {
+    let pose = |image: &PreparedImage| (image.camera.clone(), image.cam_from_world);
+    let ((first_camera, first_pose), (second_camera, second_pose)) = (pose(first), pose(second));
+    let geometry = EpipolarGeometry::new((&first_camera, &first_pose), (&second_camera, &second_pose));
+    let backward = EpipolarGeometry::new((&second_camera, &second_pose), (&first_camera, &first_pose));
+    let (Some(geometry), Some(backward)) = (geometry, backward) else { return Vec::new() };
+    let stream =
+        |from: ImageId, to: ImageId| Rng::from_parts(&[seed, RANDOM_STREAM, u64::from(from.0), u64::from(to.0)]);
+
+    let mut first_settled = vec![false; first.features.len()];
+    let mut second_settled = vec![false; second.features.len()];
+    for (a, b) in settled {
+        first_settled[a.index()] = true;
+        second_settled[b.index()] = true;
+    }
+    let open = first.finder.members().iter().copied().filter(|&query| !first_settled[query as usize]);
+    let mut search = OneWay { query: first, target: second, geometry: &geometry, options, check_ratio: true };
+    let mut matches = search.run(open, stream(first_id, second_id));
+    matches.retain(|found| !second_settled[found.target as usize]);
+    if options.mutual {
+        let mut asked: Vec<u32> = matches.iter().map(|found| found.target).collect();
+        asked.sort_unstable();
+        asked.dedup();
+        search =
+            OneWay { query: second, target: first, geometry: &backward, options, check_ratio: options.ratio_both_ways };
+        let back = search.run(asked.into_iter(), stream(second_id, first_id));
+        matches.retain(|found| {
+            let at = back.binary_search_by_key(&found.target, |returned| returned.query);
+            at.is_ok_and(|at| back[at].target == found.query)
+        });
+    } else {
+        keep_best_per_target(&mut matches);
+    }
+    gate_by_geometry(&mut matches, first, second, &geometry, options);
+    gate_by_orientation(&mut matches, first, second, options);
+    if matches.len() < options.min_pair_matches {
+        return Vec::new();
+    }
+    matches.into_iter().map(|found| (KeypointIdx(found.query), KeypointIdx(found.target))).collect()
+}
+
+/// A query's match.
+#[derive(Clone, Copy, Debug)]
+struct Found {
+    query: u32,
+    target: u32,
+    distance_sq: u32,
+}
+
+/// The search for one image's queries in another.
+struct OneWay<'a> {
+    query: &'a PreparedImage,
+    target: &'a PreparedImage,
+    geometry: &'a EpipolarGeometry,
+    options: &'a GuidedMatchOptions,
+    check_ratio: bool,
+}
+
+impl OneWay<'_> {
+    /// The matches of these queries, by query.
+    fn run(&self, queries: impl Iterator<Item = u32>, mut rng: Rng) -> Vec<Found> {
+        let Some(bounds) = self.target.finder.bounds() else { return Vec::new() };
+        let band_px = self.options.band_px * self.target.px_scale;
+        let tolerance_px = self.options.group_tolerance_px * self.target.px_scale;
+        let clearance_px = self.options.epipole_clearance_bands * self.options.band_px * self.query.px_scale;
+        let epipole = self.geometry.epipole_in_query();
+        let clear = queries
+            .filter(|&q| epipole.is_none_or(|e| (self.query.finder.positions()[q as usize] - e).norm() >= clearance_px))
+            .map(|q| (q, self.query.normalized[q as usize]));
+        let groups = group_by_line(self.geometry, clear, &bounds.grown(band_px), tolerance_px);
+
+        let mut pads = Padding::new(self.target.finder.members(), &mut rng);
+        let (mut marks, mut rows) = (SeenMarks::default(), Vec::new());
+        let (mut packed, mut nearest) = (PackedDescriptors::new(), Vec::new());
+        let mut descriptors: Vec<Descriptor> = Vec::new();
+        let mut found = Vec::new();
+        for group in &groups {
+            self.target.finder.near_line(&group.anchor, &mut marks, &mut rows);
+            let candidates = rows.len();
+            if candidates == 0 {
+                continue;
+            }
+            pads.fill(&mut rows, self.options.pad_to, &mut marks, &mut rng);
+            packed.repack_subset(&self.target.features.descriptors, &rows);
+            descriptors.clear();
+            descriptors.extend(group.queries.iter().map(|&q| self.query.features.descriptors[q as usize]));
+            top2(&descriptors, &packed, &mut nearest);
+            for (&query, nearest) in group.queries.iter().zip(&nearest) {
+                if (nearest.index as usize) < candidates && self.accepts(query, nearest, &rows, band_px) {
+                    found.push(Found { query, target: rows[nearest.index as usize], distance_sq: nearest.distance_sq });
+                }
+            }
+        }
+        found.sort_unstable_by_key(|found| found.query);
+        found
+    }
+
+    /// Whether the best candidate passes the ratio test and the exact distance test (equation 3) against the query's own
+    /// line, not only its group's.
+    fn accepts(&self, query: u32, nearest: &Top2, rows: &[u32], band_px: f64) -> bool {
+        let best = rows[nearest.index as usize];
+        let position = &self.target.finder.positions()[best as usize];
+        let near = |line: EpipolarLine| line.distance_px(position) <= band_px;
+        (!self.check_ratio || self.passes_ratio(query, nearest, rows))
+            && self.geometry.line_in_target(&self.query.normalized[query as usize]).is_some_and(near)
+    }
+
+    fn passes_ratio(&self, query: u32, nearest: &Top2, rows: &[u32]) -> bool {
+        let best = rows[nearest.index as usize];
+        let allows = |second: u32| {
+            let ratio_sq = self.options.max_ratio * self.options.max_ratio;
+            f64::from(nearest.distance_sq) <= ratio_sq * f64::from(second)
+        };
+        let Some(second) = nearest.second_distance_sq else { return false };
+        if allows(second) {
+            return true;
+        }
+        // The rival may be at the best candidate's own place: then the nearest elsewhere counts.
+        let here = self.target.same_place.others(best);
+        if here.is_empty() {
+            return false;
+        }
+        let descriptor = &self.query.features.descriptors[query as usize];
+        let elsewhere = rows.iter().filter(|&&row| row != best && !here.contains(&row));
+        elsewhere
+            .map(|&row| distance_sq(descriptor, &self.target.features.descriptors[row as usize]))
+            .min()
+            .is_some_and(allows)
+    }
+}
+
+/// Random features of the target to fill small candidate sets.
+struct Padding {
+    shuffled: Vec<u32>,
+}
+
+impl Padding {
+    fn new(members: &[u32], rng: &mut Rng) -> Self {
+        let mut shuffled = members.to_vec();
+        rng.shuffle(&mut shuffled);
+        Self { shuffled }
+    }
+
+    /// Appends features that are not marked until there are `wanted` rows or no more features.
+    fn fill(&mut self, rows: &mut Vec<u32>, wanted: usize, marks: &mut SeenMarks, rng: &mut Rng) {
+        if rows.len() >= wanted {
+            return;
+        }
+        let n = self.shuffled.len();
+        let start = rng.below(n);
+        for step in 0..n {
+            if rows.len() >= wanted {
+                return;
+            }
+            let feature = self.shuffled[(start + step) % n];
+            if marks.mark(feature) {
+                rows.push(feature);
+            }
+        }
+    }
+}
+
+/// Of the matches to one target the one with the nearest descriptor (ties: the first query).
+fn keep_best_per_target(matches: &mut Vec<Found>) {
+    matches.sort_unstable_by_key(|found| (found.target, found.distance_sq, found.query));
+    matches.dedup_by_key(|found| found.target);
+    matches.sort_unstable_by_key(|found| found.query);
+}
+
+/// Drops matches that would be behind a camera, or whose keypoints differ in scale in a way their depths do not explain: an
+/// object of size s at depth z shows with size `f s / z`.
+fn gate_by_geometry(
+    matches: &mut Vec<Found>,
+    first: &PreparedImage,
+    second: &PreparedImage,
+    geometry: &EpipolarGeometry,
+    options: &GuidedMatchOptions,
+) {
+    if !options.cheirality && options.max_scale_discrepancy.is_none() {
+        return;
+    }
+    let focal_ratio = second.camera.mean_focal_px() / first.camera.mean_focal_px();
+    matches.retain(|found| {
+        let (a, b) = (found.query as usize, found.target as usize);
+        let Some((depth_a, depth_b)) = geometry.depths(&first.normalized[a], &second.normalized[b]) else {
+            return false;
+        };
+        if depth_a <= 0.0 || depth_b <= 0.0 {
+            // Without positive depths scales foretell nothing.
+            return !options.cheirality;
+        }
+        let expected = focal_ratio * depth_a / depth_b;
+        let actual = f64::from(second.features.keypoints[b].scale) / f64::from(first.features.keypoints[a].scale);
+        options.max_scale_discrepancy.is_none_or(|factor| (actual / expected).ln().abs() <= factor.ln())
+    });
+}
+
+/// Bins of the histogram of orientation changes: 10 degrees each.
+const ORIENTATION_BINS: usize = 36;
+
+/// Drops matches whose keypoints turn otherwise than most of the pair's.
+fn gate_by_orientation(
+    matches: &mut Vec<Found>,
+    first: &PreparedImage,
+    second: &PreparedImage,
+    options: &GuidedMatchOptions,
+) {
+    let Some(limit_deg) = options.max_orientation_discrepancy_deg else { return };
+    let turn = |found: &Found| {
+        let from = f64::from(first.features.keypoints[found.query as usize].orientation);
+        (f64::from(second.features.keypoints[found.target as usize].orientation) - from).rem_euclid(TAU)
+    };
+    let bin_width = TAU / ORIENTATION_BINS as f64;
+    let mut histogram = [0usize; ORIENTATION_BINS];
+    for found in matches.iter() {
+        histogram[((turn(found) / bin_width) as usize).min(ORIENTATION_BINS - 1)] += 1;
+    }
+    let around =
+        |bin: usize| (0..3).map(|k| histogram[(bin + ORIENTATION_BINS + k - 1) % ORIENTATION_BINS]).sum::<usize>();
+    let Some(mode) = (0..ORIENTATION_BINS).rev().max_by_key(|&bin| around(bin)) else { return };
+    let commonest = (mode as f64 + 0.5) * bin_width;
+    matches.retain(|found| {
+        let off = (turn(found) - commonest + PI).rem_euclid(TAU) - PI;
+        off.abs() <= limit_deg.to_radians()
+    });
+}

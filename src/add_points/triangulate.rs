@@ -1,0 +1,163 @@
+//! Tracks of each image's features, triangulated image by image (paper, section 6.3).
+//!
+//! A keypoint of the query image with its matches in all candidate images is a star-shaped track. Guided matches can be
+//! wrong along the epipolar line, so a track of three or more sightings is triangulated robustly: the query's ray is
+//! intersected with every other one, the intersection (or the position of a model's point that one of the sightings
+//! already sees) that most sightings agree with is kept, and its inliers give the linear least-squares point of the paper,
+//! refined to the least reprojection error. Every image is independent of all others; the merge ([`super::merge`]) joins
+//! what they found.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use super::guided_match::KeypointMatch;
+use super::views::{Sighting, ViewTable};
+use crate::geometry::triangulation::{refine_point, triangulate_dlt};
+use crate::scene::{ImageId, KeypointIdx, Reconstruction};
+
+/// The matches of one pair.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PairMatches {
+    /// The first image.
+    pub first: ImageId,
+    /// The second.
+    pub second: ImageId,
+    /// Keypoints of the first and of the second that belong together, each at most once.
+    pub matches: Vec<KeypointMatch>,
+}
+
+/// A query keypoint and those of its matches that see one point with it.
+#[derive(Clone, Debug)]
+pub struct StarTrack {
+    /// The sightings that agree, the query's first, then by rank; one an image, two or more.
+    pub sightings: Vec<Sighting>,
+    /// The point.
+    pub xyz: Vector3<f64>,
+    /// Mean of the squared errors, relative to what is allowed.
+    pub mean_relative_error_sq: f64,
+}
+
+/// The tracks of all images' keypoints, by image and keypoint.
+pub fn star_tracks(model: &Reconstruction, table: &ViewTable, matches: &[PairMatches]) -> Vec<StarTrack> {
+    // The pairs of each image, as (index of the pair, whether it is the pair's first).
+    let mut pairs_of: Vec<Vec<(usize, bool)>> = vec![Vec::new(); table.len()];
+    for (index, pair) in matches.iter().enumerate() {
+        if let (Some(first), Some(second)) = (table.rank(pair.first), table.rank(pair.second)) {
+            pairs_of[first as usize].push((index, true));
+            pairs_of[second as usize].push((index, false));
+        }
+    }
+    let of_image = |rank: usize| stars_of_image(model, table, matches, rank as u32, &pairs_of[rank]);
+    let stars: Vec<Vec<StarTrack>> = (0..table.len()).into_par_iter().map(of_image).collect();
+    stars.into_iter().flatten().collect()
+}
+
+fn stars_of_image(
+    model: &Reconstruction,
+    table: &ViewTable,
+    matches: &[PairMatches],
+    rank: u32,
+    pairs: &[(usize, bool)],
+) -> Vec<StarTrack> {
+    let mut links: Vec<(KeypointIdx, Sighting)> = Vec::new();
+    for &(index, is_first) in pairs {
+        let pair = &matches[index];
+        let other = table.rank(if is_first { pair.second } else { pair.first }).expect("pairs were filtered by rank");
+        links.extend(pair.matches.iter().map(|&(a, b)| {
+            let (own, keypoint) = if is_first { (a, b) } else { (b, a) };
+            (own, Sighting { rank: other, keypoint })
+        }));
+    }
+    links.sort_unstable();
+    let mut stars = Vec::new();
+    let mut track = Vec::new();
+    for links in links.chunk_by(|a, b| a.0 == b.0) {
+        track.clear();
+        track.push(Sighting { rank, keypoint: links[0].0 });
+        track.extend(links.iter().map(|&(_, seen)| seen));
+        stars.extend(triangulate_star(model, table, &track));
+    }
+    stars
+}
+
+/// The point that a star's query sees together with most of its matches; none when it agrees with none of them.
+pub fn triangulate_star(model: &Reconstruction, table: &ViewTable, track: &[Sighting]) -> Option<StarTrack> {
+    let query = track[0];
+    let query_ray = table.ray(query);
+    let known = track.iter().filter_map(|&seen| {
+        let point = table.image(seen.rank).points()[seen.keypoint.index()]?;
+        Some(model.point(point)?.xyz)
+    });
+    let crossings = track[1..].iter().filter_map(|&seen| nearest_to_rays(query_ray, table.ray(seen)));
+    let cost_of =
+        |xyz: &Vector3<f64>| -> f64 { track.iter().map(|&seen| table.relative_error_sq(seen, xyz).min(1.0)).sum() };
+    let (xyz, _) = known
+        .chain(crossings)
+        .map(|xyz| (xyz, cost_of(&xyz)))
+        .filter(|(_, cost)| !cost.is_nan())
+        .min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let inliers = |xyz: &Vector3<f64>| -> Vec<Sighting> {
+        track.iter().copied().filter(|&seen| table.relative_error_sq(seen, xyz) <= 1.0).collect()
+    };
+    let (xyz, sightings) = refit(table, xyz, inliers)?;
+    if sightings[0] != query {
+        return None;
+    }
+    let errors: f64 = sightings.iter().map(|&seen| table.relative_error_sq(seen, &xyz)).sum();
+    Some(StarTrack { mean_relative_error_sq: errors / sightings.len() as f64, sightings, xyz })
+}
+
+/// Rounds of [`refit`]: the inliers have settled after one or two.
+const MAX_REFITS: usize = 3;
+
+/// Fits a point to the sightings that `inliers` grants it, again until these stay the same. A fit that loses sightings is
+/// undone; none when there are fewer than two from the start.
+pub fn refit(
+    table: &ViewTable,
+    start: Vector3<f64>,
+    inliers: impl Fn(&Vector3<f64>) -> Vec<Sighting>,
+) -> Option<(Vector3<f64>, Vec<Sighting>)> {
+    let (mut xyz, mut granted) = (start, inliers(&start));
+    if granted.len() < 2 {
+        return None;
+    }
+    for _ in 0..MAX_REFITS {
+        let views: Vec<_> = granted.iter().map(|&seen| table.view(seen)).collect();
+        // The linear point can lie behind a camera when rays are nearly parallel; the start is then the better one.
+        let linear = triangulate_dlt(&views).map(|linear| refine_point(&views, &linear));
+        let fitted = linear.filter(|fitted| fitted.iter().all(|c| c.is_finite()));
+        let Some(fitted) = fitted else { break };
+        let fitted_granted = inliers(&fitted);
+        if fitted_granted.len() < granted.len() {
+            break;
+        }
+        let settled = fitted_granted == granted;
+        (xyz, granted) = (fitted, fitted_granted);
+        if settled {
+            break;
+        }
+    }
+    Some((xyz, granted))
+}
+
+/// Rays at a smaller sine of their angle than this have no crossing to speak of (1e-6 rad is a thousandth of a pixel).
+const MIN_SINE_SQ: f64 = 1e-12;
+
+/// The point half-way between two rays (centre, direction) where they are nearest; none for parallel rays and where they are
+/// nearest behind a centre.
+///
+/// With `w` the vector between the centres, the depths s, t minimise `|s a - t b - w|^2`:
+/// `s = ((a.w)(b.b) - (a.b)(b.w)) / D`, `t = ((a.b)(a.w) - (a.a)(b.w)) / D`, `D = (a.a)(b.b) - (a.b)^2`.
+fn nearest_to_rays(
+    (center_a, a): (Vector3<f64>, Vector3<f64>),
+    (center_b, b): (Vector3<f64>, Vector3<f64>),
+) -> Option<Vector3<f64>> {
+    let w = center_b - center_a;
+    let (aa, bb, ab, aw, bw) = (a.dot(&a), b.dot(&b), a.dot(&b), a.dot(&w), b.dot(&w));
+    let determinant = aa * bb - ab * ab;
+    if determinant <= MIN_SINE_SQ * aa * bb {
+        return None;
+    }
+    let (s, t) = ((aw * bb - ab * bw) / determinant, (ab * aw - aa * bw) / determinant);
+    (s > 0.0 && t > 0.0).then(|| (center_a + a * s + center_b + b * t) / 2.0)
+}
