@@ -1,0 +1,108 @@
+//! Decoded pixels to 8-bit grey or colour, and reduction in size.
+
+use fast_image_resize::images::{Image, ImageRef};
+use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
+use image::DynamicImage;
+
+use super::Decoded;
+use crate::scene::{GrayImage, RgbImage};
+
+/// ITU-R BT.601 luma, the same that JPEG stores: (77 r + 150 g + 29 b) / 256.
+fn luma(r: u8, g: u8, b: u8) -> u8 {
+    ((77 * u32::from(r) + 150 * u32::from(g) + 29 * u32::from(b) + 128) >> 8) as u8
+}
+
+/// 16 bits to 8, rounded.
+fn narrow(value: u16) -> u8 {
+    ((u32::from(value) * 255 + 32_767) / 65_535) as u8
+}
+
+/// A real sample, 1 being white, to 8 bits; not-a-number is black.
+fn quantize(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+/// Grey of a colour raster.
+pub(super) fn rgb_to_gray(image: &RgbImage) -> GrayImage {
+    let data = image.data.chunks_exact(3).map(|p| luma(p[0], p[1], p[2])).collect();
+    GrayImage::new(image.width, image.height, data)
+}
+
+/// Grey of anything; alpha is ignored.
+pub(super) fn to_gray(image: &DynamicImage) -> GrayImage {
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    let data = match image {
+        DynamicImage::ImageLuma8(raster) => raster.as_raw().clone(),
+        DynamicImage::ImageLumaA8(raster) => raster.as_raw().chunks_exact(2).map(|p| p[0]).collect(),
+        DynamicImage::ImageLuma16(raster) => raster.as_raw().iter().map(|&v| narrow(v)).collect(),
+        DynamicImage::ImageLumaA16(raster) => raster.as_raw().chunks_exact(2).map(|p| narrow(p[0])).collect(),
+        _ => return rgb_to_gray(&to_rgb(image)),
+    };
+    GrayImage::new(width, height, data)
+}
+
+/// Colour of anything; alpha is ignored.
+pub(super) fn to_rgb(image: &DynamicImage) -> RgbImage {
+    fn opaque<T: Copy>(samples: &[T], channels: usize, to_byte: impl Fn(T) -> u8) -> Vec<u8> {
+        samples.chunks_exact(channels).flat_map(|p| [to_byte(p[0]), to_byte(p[1]), to_byte(p[2])]).collect()
+    }
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    let data = match image {
+        DynamicImage::ImageRgb8(raster) => raster.as_raw().clone(),
+        DynamicImage::ImageRgba8(raster) => opaque(raster.as_raw(), 4, |v| v),
+        DynamicImage::ImageRgb16(raster) => opaque(raster.as_raw(), 3, narrow),
+        DynamicImage::ImageRgba16(raster) => opaque(raster.as_raw(), 4, narrow),
+        DynamicImage::ImageRgb32F(raster) => opaque(raster.as_raw(), 3, quantize),
+        DynamicImage::ImageRgba32F(raster) => opaque(raster.as_raw(), 4, quantize),
+        DynamicImage::ImageLuma8(_)
+        | DynamicImage::ImageLumaA8(_)
+        | DynamicImage::ImageLuma16(_)
+        | DynamicImage::ImageLumaA16(_) => to_gray(image).data.into_iter().flat_map(|v| [v; 3]).collect(),
+        // Kinds the image crate may add later.
+        _ => image.to_rgb8().into_raw(),
+    };
+    RgbImage::new(width, height, data)
+}
+
+/// Reduces the longer side to `max_long_side`, where it is longer.
+pub(super) fn shrink_gray(image: GrayImage, max_long_side: Option<u32>) -> Decoded<GrayImage> {
+    let GrayImage { width, height, data } = image;
+    let (data, (new_width, new_height)) = shrink(data, (width, height), PixelType::U8, max_long_side);
+    Decoded {
+        image: GrayImage::new(new_width, new_height, data),
+        to_original: [width as f64 / new_width as f64, height as f64 / new_height as f64],
+    }
+}
+
+/// Reduces the longer side to `max_long_side`, where it is longer.
+pub(super) fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbImage> {
+    let RgbImage { width, height, data } = image;
+    let (data, (new_width, new_height)) = shrink(data, (width, height), PixelType::U8x3, max_long_side);
+    Decoded {
+        image: RgbImage::new(new_width, new_height, data),
+        to_original: [width as f64 / new_width as f64, height as f64 / new_height as f64],
+    }
+}
+
+/// The Lanczos filter of fast_image_resize widens with the reduction, so it neither aliases nor shifts: the corner of the
+/// first pixel stays at (0, 0).
+fn shrink(
+    data: Vec<u8>,
+    (width, height): (usize, usize),
+    pixel_type: PixelType,
+    max_long_side: Option<u32>,
+) -> (Vec<u8>, (usize, usize)) {
+    let longer = width.max(height);
+    let target = max_long_side.map_or(longer, |side| (side as usize).max(1));
+    if longer <= target {
+        return (data, (width, height));
+    }
+    let scaled = |side: usize| ((side * target + longer / 2) / longer).max(1);
+    let (new_width, new_height) = (scaled(width), scaled(height));
+    let source = ImageRef::new(width as u32, height as u32, &data, pixel_type)
+        .expect("the raster's length was checked when it was made");
+    let mut reduced = Image::new(new_width as u32, new_height as u32, pixel_type);
+    let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Lanczos3));
+    Resizer::new().resize(&source, &mut reduced, &options).expect("both rasters are of one pixel type");
+    (reduced.into_vec(), (new_width, new_height))
+}
