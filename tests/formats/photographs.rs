@@ -111,7 +111,7 @@ fn cmyk_jpeg(values: [u8; 4], side: u16) -> Vec<u8> {
             bits += &if block == 0 { format!("10{coded:06b}0") } else { "00".to_owned() };
         }
     }
-    while bits.len() % 8 != 0 {
+    while !bits.len().is_multiple_of(8) {
         bits.push('1');
     }
     for chunk in bits.as_bytes().chunks(8) {
