@@ -2,18 +2,14 @@
 export {
   BufferAttribute,
   BufferGeometry,
-  Color,
-  GridHelper,
   Group,
   LineBasicMaterial,
   LineSegments,
   Matrix4,
   PerspectiveCamera,
   Points,
-  Raycaster,
   Scene,
   ShaderMaterial,
-  Vector2,
   Vector3,
   WebGLRenderer,
 } from "three";

@@ -1,0 +1,107 @@
+// The stages of a run as a list that moves.
+
+import { isOver } from "./api.js";
+import { fill, h, icon } from "./dom.js";
+import { count, duration, stageName, timeLeft } from "./format.js";
+
+const MARKS = {
+  pending: "M12 12h0M5 12a7 7 0 1 0 14 0a7 7 0 1 0-14 0",
+  running: "M12 4a8 8 0 1 1-8 8",
+  done: "M5 12.500l4.500 4.500L19 7.500",
+  reused: "M5 12.500l4.500 4.500L19 7.500",
+  stopped: "M6.500 6.500l11 11M17.500 6.500l-11 11",
+};
+
+const STATE_WORDS = { pending: "to come", running: "running", done: "done", reused: "kept from before", stopped: "stopped here" };
+
+/** Counts in words, in the order they matter. */
+const COUNT_WORDS = /_px$|_s$/;
+
+export function stagePanel() {
+  const overall = h("div", { class: "overall" });
+  const list = h("ol", { class: "stages" });
+  const details = h("details", { open: true }, h("summary", {}, "Stages"), list);
+  const element = h("section", { class: "card", "aria-label": "Progress" }, overall, details);
+  const rows = new Map();
+  let wasOver = null;
+
+  function show(job) {
+    const over = isOver(job);
+    if (over !== wasOver) {
+      details.open = !over || job.state !== "succeeded";
+      wasOver = over;
+    }
+    showOverall(job, over);
+    const keys = new Set();
+    for (const stage of job.stages) {
+      const key = `${stage.name}/${stage.iteration ?? ""}`;
+      keys.add(key);
+      if (!rows.has(key)) rows.set(key, row());
+      const { element: li, update } = rows.get(key);
+      update(stage, over && stage.state === "running" ? "stopped" : stage.state);
+      list.append(li);
+    }
+    for (const [key, { element: li }] of rows) {
+      if (!keys.has(key)) {
+        li.remove();
+        rows.delete(key);
+      }
+    }
+    details.hidden = job.stages.length === 0;
+  }
+
+  function showOverall(job, over) {
+    if (over) {
+      const took = job.started_at && job.finished_at ? duration((new Date(job.finished_at) - new Date(job.started_at)) / 1000) : null;
+      fill(overall, h("p", {}, took ? `Took ${took}.` : "It did not start."));
+      return;
+    }
+    if (job.state === "queued") {
+      fill(overall, h("p", {}, "Waiting for its turn: jobs run one after another."));
+      return;
+    }
+    const finished = job.stages.filter((s) => s.state === "done" || s.state === "reused").length;
+    const now = job.stage;
+    const part = now?.total ? now.done / now.total : 0;
+    const done = job.stages.length > 0 ? (finished + part) / job.stages.length : 0;
+    const text = now ? `${stageName(now)}${now.total ? `: ${count(now.done)} of ${count(now.total)}` : ""}` : "Starting";
+    const left = timeLeft(job.eta_s);
+    let bar = overall.querySelector("progress");
+    if (!bar) {
+      fill(overall, h("p", { class: "number" }), h("progress", { max: 1, value: 0, "aria-label": "The whole job" }));
+      bar = overall.querySelector("progress");
+    }
+    overall.querySelector("p").textContent = left ? `${text} \u00b7 ${left}` : text;
+    bar.value = done;
+  }
+
+  return { element, show };
+}
+
+function row() {
+  const mark = h("span");
+  const what = h("span", { class: "what" });
+  const bar = h("progress", { max: 1 });
+  const gap = h("span", { class: "gap" });
+  const time = h("span", { class: "time" });
+  const counts = h("span", { class: "counts" });
+  const element = h("li", {}, mark, what, bar, time, counts);
+  let shown = null;
+
+  function update(stage, state) {
+    if (shown !== state) {
+      shown = state;
+      element.className = state;
+      fill(mark, icon(MARKS[state], { class: "mark" }));
+      fill(what, stageName(stage), h("span", { class: "visually-hidden" }, `: ${STATE_WORDS[state]}`));
+      bar.setAttribute("aria-label", stageName(stage));
+      (state === "running" ? gap : bar).replaceWith(state === "running" ? bar : gap);
+    }
+    if (state === "running" && stage.total) bar.value = stage.done / stage.total;
+    else bar.removeAttribute("value");
+    time.textContent = state === "running" && stage.total ? `${count(stage.done)} / ${count(stage.total)}` : state === "reused" ? "kept" : stage.wall_s === null ? "" : duration(stage.wall_s);
+    counts.textContent = Object.entries(stage.counts ?? {}).map(([name, value]) => `${COUNT_WORDS.test(name) ? value.toFixed(2) : count(value)} ${name.replaceAll("_", " ")}`).join(" \u00b7 ");
+    counts.hidden = counts.textContent === "";
+  }
+  return { element, update };
+}
