@@ -95,7 +95,7 @@ function newJob() {
       return;
     }
     const few = selection.archives.size === 0 && selection.pictures.size < 3;
-    const name = h("input", { type: "text", id: "job-name", maxlength: 200, value: selection.folder, autocomplete: "off" });
+    const name = h("input", { type: "text", id: "job-name", maxlength: 200, value: selection.folder || `Pictures of ${new Intl.DateTimeFormat(undefined, { dateStyle: "medium" }).format(new Date())}`, autocomplete: "off" });
     const options = optionFields();
     const what = [
       selection.pictures.size > 0 && plural(selection.pictures.size, "picture"),

@@ -18,10 +18,13 @@ const PURPOSES = [
 /** These first, the rest under "all files". */
 const FIRST = /^(report\.html|report\.json|ply\/\d+\/(points|cameras)\.ply)$/;
 
-const order = (path) => PURPOSES.findIndex(([form]) => form.test(path)) >>> 0;
+function order(path) {
+  const at = PURPOSES.findIndex(([form]) => form.test(path));
+  return at < 0 ? PURPOSES.length : at;
+}
 
 export function downloads(job) {
-  const body = h("div", {}, h("p", { class: "muted" }, "Loading ..."));
+  const body = h("div", { class: "downloads" }, h("p", { class: "muted" }, "Loading ..."));
   const element = h("section", { class: "card", "aria-labelledby": "downloads-title" }, h("h2", { id: "downloads-title" }, "Downloads"), body);
   jobOutputs(job).then((list) => {
     if (list.files.length === 0) {

@@ -5,7 +5,7 @@ import { fill, h, icon } from "./dom.js";
 import { count, duration, stageName, timeLeft } from "./format.js";
 
 const MARKS = {
-  pending: "M12 12h0M5 12a7 7 0 1 0 14 0a7 7 0 1 0-14 0",
+  pending: "M5 12a7 7 0 1 0 14 0a7 7 0 1 0-14 0",
   running: "M12 4a8 8 0 1 1-8 8",
   done: "M5 12.500l4.500 4.500L19 7.500",
   reused: "M5 12.500l4.500 4.500L19 7.500",
@@ -14,13 +14,19 @@ const MARKS = {
 
 const STATE_WORDS = { pending: "to come", running: "running", done: "done", reused: "kept from before", stopped: "stopped here" };
 
-/** Counts in words, in the order they matter. */
-const COUNT_WORDS = /_px$|_s$/;
+/** Counts that are measures, not whole numbers. */
+const MEASURE = /_px$|_s$/;
+
+function tookOf(job) {
+  if (!job.started_at || !job.finished_at) return "It did not start";
+  return `Took ${duration((new Date(job.finished_at) - new Date(job.started_at)) / 1000)}: the stages`;
+}
 
 export function stagePanel() {
   const overall = h("div", { class: "overall" });
   const list = h("ol", { class: "stages" });
-  const details = h("details", { open: true }, h("summary", {}, "Stages"), list);
+  const summary = h("summary", {}, "Stages");
+  const details = h("details", { open: true }, summary, list);
   const element = h("section", { class: "card", "aria-label": "Progress" }, overall, details);
   const rows = new Map();
   let wasOver = null;
@@ -32,6 +38,7 @@ export function stagePanel() {
       wasOver = over;
     }
     showOverall(job, over);
+    summary.textContent = over ? tookOf(job) : "Stages";
     const keys = new Set();
     for (const stage of job.stages) {
       const key = `${stage.name}/${stage.iteration ?? ""}`;
@@ -52,10 +59,10 @@ export function stagePanel() {
 
   function showOverall(job, over) {
     if (over) {
-      const took = job.started_at && job.finished_at ? duration((new Date(job.finished_at) - new Date(job.started_at)) / 1000) : null;
-      fill(overall, h("p", {}, took ? `Took ${took}.` : "It did not start."));
+      overall.hidden = true;
       return;
     }
+    overall.hidden = false;
     if (job.state === "queued") {
       fill(overall, h("p", {}, "Waiting for its turn: jobs run one after another."));
       return;
@@ -100,7 +107,7 @@ function row() {
     if (state === "running" && stage.total) bar.value = stage.done / stage.total;
     else bar.removeAttribute("value");
     time.textContent = state === "running" && stage.total ? `${count(stage.done)} / ${count(stage.total)}` : state === "reused" ? "kept" : stage.wall_s === null ? "" : duration(stage.wall_s);
-    counts.textContent = Object.entries(stage.counts ?? {}).map(([name, value]) => `${COUNT_WORDS.test(name) ? value.toFixed(2) : count(value)} ${name.replaceAll("_", " ")}`).join(" \u00b7 ");
+    counts.textContent = Object.entries(stage.counts ?? {}).map(([name, value]) => `${MEASURE.test(name) ? value.toFixed(2) : count(value)} ${name.replaceAll("_", " ")}`).join(" \u00b7 ");
     counts.hidden = counts.textContent === "";
   }
   return { element, update };

@@ -33,7 +33,7 @@ export async function startMock({ stage_ms = 300, fail = () => undefined, models
       images: { uploaded: j.dataset.files.size, ignored: null, ...(j.state === "succeeded" ? { registered: Math.max(0, j.dataset.files.size - 2), unregistered: 1, rejected: 1 } : { registered: null, unregistered: null, rejected: null }) },
       stage: stage ? { name: stage.name, iteration: stage.iteration, done: stage.done, total: stage.total } : null,
       stages: j.stages, eta_s: j.state === "running" ? { low: 20, high: 70 } : null,
-      models: j.state === "succeeded" ? Array.from({ length: models }, (_, k) => ({ id: k, images: 24, points: 30000, points_3plus: 21000, observations: 98000, mean_track_length: 3.27, mean_reprojection_error_px: 0.61, median_reprojection_error_px: 0.48, links: { points: `${self}/outputs/ply/${k}/points.ply`, cameras: `${self}/outputs/ply/${k}/cameras.ply` } })) : [],
+      models: j.state === "succeeded" ? Array.from({ length: models }, (_, k) => ({ id: k, images: Math.max(0, j.dataset.files.size - 2), points: 30000, points_3plus: 21000, observations: 98000, mean_track_length: 3.27, mean_reprojection_error_px: 0.61, median_reprojection_error_px: 0.48, links: { points: `${self}/outputs/ply/${k}/points.ply`, cameras: `${self}/outputs/ply/${k}/cameras.ply` } })) : [],
       error: j.error, links: { self, events: `${self}/events`, cancel: `${self}/cancel`, resume: `${self}/resume`, images: `${self}/images`, outputs: `${self}/outputs`, archive: `${self}/outputs.zip`, report: `${self}/outputs/report.html`, dataset: `/api/v1/datasets/${j.dataset.id}` },
     };
   };

@@ -44,6 +44,7 @@ export class Stage {
     this.scene = new three.Scene();
     this.model = new three.Group();
     this.scene.add(this.model);
+    this.model.rotation.set(...UP_TURNS.z);
     this.camera = new three.PerspectiveCamera(FOV_DEG, 1, 0.01, 1000);
     this.controls = new three.OrbitControls(this.camera, canvas);
     this.controls.enableDamping = !matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -123,7 +124,7 @@ export class Stage {
     toward.normalize();
     const half = (FOV_DEG * Math.PI) / 360;
     const narrow = Math.min(1, this.camera.aspect);
-    const distance = (1.15 * radius) / (Math.sin(half) * narrow);
+    const distance = (0.95 * radius) / (Math.sin(half) * narrow);
     this.camera.near = distance / 500;
     this.camera.far = distance * 200;
     this.camera.position.copy(centre).addScaledVector(toward, distance);
