@@ -47,15 +47,15 @@ pub fn homography_four_point(a: &[Vector2<f64>; 4], b: &[Vector2<f64>; 4]) -> Op
 }
 
 /// The homography (unit Frobenius norm) of at least four pairs `(x_a, x_b)`, `x_b ~ H x_a`, with the least algebraic error.
-pub fn homography_dlt(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Option<Matrix3<f64>> {
-    if pairs.len() < 4 {
+pub fn homography_dlt(pairs: impl Iterator<Item = (Vector2<f64>, Vector2<f64>)> + Clone) -> Option<Matrix3<f64>> {
+    if pairs.clone().take(4).count() < 4 {
         return None;
     }
-    let in_a = Normalization::of(pairs.iter().map(|pair| pair.0))?;
-    let in_b = Normalization::of(pairs.iter().map(|pair| pair.1))?;
+    let in_a = Normalization::of(pairs.clone().map(|pair| pair.0))?;
+    let in_b = Normalization::of(pairs.clone().map(|pair| pair.1))?;
     let mut moments = SMatrix::<f64, 9, 9>::zeros();
     for (a, b) in pairs {
-        for row in equations(&in_a.apply(a), &in_b.apply(b)) {
+        for row in equations(&in_a.apply(&a), &in_b.apply(&b)) {
             let row = SVector::<f64, 9>::from(row);
             moments.ger(1.0, &row, &row, 1.0);
         }
@@ -94,7 +94,7 @@ mod tests {
         for _ in 0..1000 {
             let h = random_homography(&mut rng);
             let pairs: Vec<_> = (0..20).map(|_| pair(&mut rng, &h)).collect();
-            assert!(matrix_distance(&homography_dlt(&pairs).unwrap(), &h) < 1e-8);
+            assert!(matrix_distance(&homography_dlt(pairs.iter().copied()).unwrap(), &h) < 1e-8);
             let (a, b) = (std::array::from_fn(|i| pairs[i].0), std::array::from_fn(|i| pairs[i].1));
             let close = homography_four_point(&a, &b).is_some_and(|found| matrix_distance(&found, &h) < 1e-6);
             failures += usize::from(!close);
