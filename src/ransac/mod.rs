@@ -1,5 +1,6 @@
 //! Robust estimation: a loop that knows no geometry, and its estimators.
 
+pub mod absolute_pose;
 mod driver;
 mod sampson;
 mod two_view;

@@ -8,6 +8,7 @@ pub mod homography;
 mod normalization;
 mod null_space;
 pub mod p3p;
+pub mod p4pf;
 pub mod seven_point;
 mod solutions;
 #[cfg(test)]
