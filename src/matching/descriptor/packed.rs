@@ -99,14 +99,16 @@ impl PackedDescriptors {
     }
 }
 
-/// Squared length of a descriptor.
+/// Squared length of a descriptor. At most 128 * 255^2, so wrapping never happens; saying so keeps the loop free of checks.
 #[inline(always)]
 pub(super) fn norm_sq(descriptor: &Descriptor) -> i32 {
-    descriptor.iter().map(|&byte| i32::from(byte) * i32::from(byte)).sum()
+    descriptor
+        .iter()
+        .fold(0, |sum, &byte| i32::wrapping_add(sum, i32::from(u16::wrapping_mul(byte.into(), byte.into()))))
 }
 
 #[inline(always)]
 fn bias(row: &Descriptor) -> i32 {
-    let sum: i32 = row.iter().map(|&byte| i32::from(byte)).sum();
+    let sum = row.iter().fold(0, |sum, &byte| i32::wrapping_add(sum, byte.into()));
     norm_sq(row) - 2 * i32::from(QUERY_OFFSET) * sum
 }
