@@ -1,1 +1,5 @@
 //! Coarse model estimation (paper, section 4).
+
+pub mod hybrid_match;
+pub mod pair_selection;
+pub mod selection;

@@ -125,19 +125,12 @@ unsafe fn scan<K: Kernel, const Q: usize, const G: usize>(
             };
             for (q, found) in found.into_iter().take(used).enumerate() {
                 match out.get_mut(first + q) {
-                    Some(before) => *before = merge(*before, found),
+                    Some(before) => *before = before.joined_with(found),
                     None => out.push(found),
                 }
             }
         }
     }
-}
-
-/// The nearest of two disjoint sets, of which the first has the lower indices.
-fn merge(before: Top2, after: Top2) -> Top2 {
-    let (best, other) = if after.distance_sq < before.distance_sq { (after, before) } else { (before, after) };
-    let runner_up = best.second_distance_sq.map_or(other.distance_sq, |second| second.min(other.distance_sq));
-    Top2 { second_distance_sq: Some(runner_up), ..best }
 }
 
 /// Vectors that run along a chunk for one query.
@@ -167,8 +160,8 @@ unsafe fn scan_block<K: Kernel, const Q: usize, const G: usize>(
         let mut at = groups.start;
         for tile in tiles {
             let dots = K::dots::<Q, G>(prepared, tile);
-            for g in 0..G {
-                let column = std::array::from_fn(|q| dots[q][g]);
+            let columns: [[K::Lanes; Q]; G] = std::array::from_fn(|g| std::array::from_fn(|q| dots[q][g]));
+            for column in columns {
                 update::<K, Q>(&column, norms_sq, first_query, &biases[at], at, &mut running, rows.as_deref_mut());
                 at += 1;
             }
@@ -233,17 +226,14 @@ unsafe fn reduce<K: Kernel>(running: &Running<K::Lanes>) -> Top2 {
         K::store(running.group, &mut group);
     }
     let nearest = best.iter().copied().fold(i32::MAX, i32::min);
-    let mut index = i32::MAX;
-    for lane in 0..GROUP_ROWS {
-        let row = group[lane] * GROUP_ROWS as i32 + lane as i32;
-        index = index.min(if best[lane] == nearest { row } else { i32::MAX });
-    }
+    let rows: [i32; GROUP_ROWS] = std::array::from_fn(|lane| {
+        if best[lane] == nearest { group[lane] * GROUP_ROWS as i32 + lane as i32 } else { i32::MAX }
+    });
+    let index = rows.into_iter().fold(i32::MAX, i32::min);
     let winner = index as usize % GROUP_ROWS;
     // In the winner's lane its own second takes the place of the best.
-    let mut runner_up = second[winner];
-    for lane in 0..GROUP_ROWS {
-        runner_up = runner_up.min(if lane == winner { i32::MAX } else { best[lane] });
-    }
+    best[winner] = second[winner];
+    let runner_up = best.into_iter().fold(i32::MAX, i32::min);
     Top2 {
         index: index as u32,
         distance_sq: nearest as u32,

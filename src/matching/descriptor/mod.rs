@@ -47,6 +47,15 @@ pub struct Top2 {
     pub second_distance_sq: Option<u32>,
 }
 
+impl Top2 {
+    /// The nearest of two disjoint sets, given the nearest of each; `later` numbers its rows above those of `self`.
+    pub fn joined_with(self, later: Self) -> Self {
+        let (best, other) = if later.distance_sq < self.distance_sq { (later, self) } else { (self, later) };
+        let runner_up = best.second_distance_sq.map_or(other.distance_sq, |second| second.min(other.distance_sq));
+        Self { second_distance_sq: Some(runner_up), ..best }
+    }
+}
+
 /// For every query the nearest and second-nearest row of `packed`, into `out` (cleared first), in query order, with the
 /// fastest instructions of this machine. `out` stays empty when `packed` is empty.
 pub fn top2(queries: &[Descriptor], packed: &PackedDescriptors, out: &mut Vec<Top2>) {

@@ -1,0 +1,97 @@
+//! Which features the coarse stage uses: the top eta percent by scale (paper, section 4).
+//!
+//! Features of large scale are few, cover most levels of the scale space, repeat better under changes of light and view,
+//! and so appear in more tracks than their number lets expect. Features are sorted by descending scale, so the selection is
+//! a prefix. The paper chooses 20 % for images of 10,000 to 30,000 features and all features below 1000; images with few
+//! features need a floor, or 20 % of 2000 would leave too little to match.
+
+use serde::{Deserialize, Serialize};
+
+/// How many features of an image enter the coarse stage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SelectionOptions {
+    /// eta: share of an image's features, by descending scale, in percent. Higher: more matches and images in the coarse
+    /// model, quadratically more matching time. 20 in the paper, which finds 10 to 30 useful.
+    pub eta_percent: f64,
+    /// An image with fewer features than this uses all of them. 1000 in the paper.
+    pub all_below: usize,
+    /// At least this many features, however small the share. Ours.
+    pub min_features: usize,
+    /// At most this many features, however large the share; null for no limit. Bounds the time of matching a pair. Ours.
+    pub max_features: Option<usize>,
+}
+
+impl Default for SelectionOptions {
+    fn default() -> Self {
+        Self { eta_percent: 20.0, all_below: 1000, min_features: 1500, max_features: Some(4096) }
+    }
+}
+
+impl SelectionOptions {
+    /// Adds a sentence for every value out of range.
+    pub fn validate(&self, errors: &mut Vec<String>) {
+        if !(self.eta_percent > 0.0 && self.eta_percent <= 100.0) {
+            errors.push(format!("eta_percent is {}, it must be above 0 and at most 100", self.eta_percent));
+        }
+        if self.max_features.is_some_and(|max| max < self.min_features) {
+            errors.push(format!("max_features is below min_features ({})", self.min_features));
+        }
+    }
+
+    /// How many of an image's features are selected: the first so many.
+    pub fn num_selected(&self, num_features: usize) -> usize {
+        if num_features < self.all_below {
+            return num_features;
+        }
+        let share = (0.01 * self.eta_percent * num_features as f64).ceil() as usize;
+        share.max(self.min_features).min(self.max_features.unwrap_or(usize::MAX)).min(num_features)
+    }
+
+    /// The next wider selection, for photographs that the present one leaves unconnected: twice the share and the limits,
+    /// and from 40 % on everything. None when everything is selected already.
+    pub fn widened(&self) -> Option<Self> {
+        const LAST_SHARE_PERCENT: f64 = 40.0;
+        if self.eta_percent >= 100.0 && self.max_features.is_none() {
+            return None;
+        }
+        let everything = self.eta_percent >= LAST_SHARE_PERCENT;
+        Some(Self {
+            eta_percent: if everything { 100.0 } else { (2.0 * self.eta_percent).min(100.0) },
+            all_below: self.all_below,
+            min_features: 2 * self.min_features,
+            max_features: if everything { None } else { self.max_features.map(|max| 2 * max) },
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_images_use_all_and_large_ones_a_fifth() {
+        let options = SelectionOptions::default();
+        let selected: Vec<usize> = [0, 999, 1400, 4000, 10_000, 30_000].map(|n| options.num_selected(n)).into();
+        assert_eq!(selected, [0, 999, 1400, 1500, 2000, 4096]);
+        let paper = SelectionOptions { min_features: 0, max_features: None, ..options };
+        assert_eq!([999, 1000, 30_000].map(|n| paper.num_selected(n)), [999, 200, 6000]);
+    }
+
+    #[test]
+    fn widening_ends_with_everything() {
+        let wider = SelectionOptions::default().widened().unwrap();
+        assert_eq!((wider.eta_percent, wider.max_features), (40.0, Some(8192)));
+        let all = wider.widened().unwrap();
+        assert_eq!(all.num_selected(100_000), 100_000);
+        assert_eq!(all.widened(), None);
+    }
+
+    #[test]
+    fn options_out_of_range_are_all_named() {
+        let mut errors = Vec::new();
+        SelectionOptions { eta_percent: 0.0, max_features: Some(10), ..SelectionOptions::default() }
+            .validate(&mut errors);
+        assert_eq!(errors.len(), 2);
+    }
+}
