@@ -8,6 +8,7 @@
 //! | [`cli`] | one file per command |
 //! | [`http`] | the web service: router, problems, routes |
 //! | [`jobs`] | states, queue, executor, recovery |
+//! | [`config`] | settings of the process |
 //! | [`pipeline`] | stage order, units of work, options, progress |
 //! | [`store`] | SQLite tables and the artifact store |
 //! | [`formats`] | bytes to domain types: photographs, EXIF, PLY, Bundler, COLMAP, reports |
@@ -28,6 +29,7 @@ pub mod bundle;
 pub mod camera;
 pub mod cli;
 pub mod coarse;
+pub mod config;
 pub mod features;
 pub mod formats;
 pub mod geometry;

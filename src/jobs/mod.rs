@@ -1,1 +1,23 @@
 //! Jobs: states, queue, executor, recovery.
+//!
+//! The database is the only truth. Requests change it ([`Jobs`]), one executor takes jobs out of it ([`Executor`]), and start-up
+//! puts it in order ([`recover`]); between them goes nothing but wake-ups ([`Hub`]).
+
+mod engine;
+mod eta;
+mod executor;
+mod hub;
+mod progress;
+mod publish;
+mod queue;
+mod recovery;
+mod state;
+pub mod view;
+
+pub use engine::{Engine, RunPaths};
+pub use eta::{Eta, estimate};
+pub use executor::{Executor, Tick};
+pub use hub::Hub;
+pub use queue::{Jobs, JobsError, MAX_NAME_CHARS, NewJob, state_of};
+pub use recovery::{Recovered, recover};
+pub use state::JobState;

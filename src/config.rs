@@ -1,0 +1,91 @@
+//! Settings of the service's process.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::store::ArchiveLimits;
+
+/// How far one upload request may go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct UploadLimits {
+    /// Bytes of the whole request.
+    pub max_upload_bytes: u64,
+    /// Photographs of one request, unpacked ones included.
+    pub max_files: usize,
+    /// Bytes of one photograph.
+    pub max_file_bytes: u64,
+    /// Unpacking.
+    pub archive: ArchiveLimits,
+}
+
+impl Default for UploadLimits {
+    fn default() -> Self {
+        Self {
+            max_upload_bytes: 256 << 30,
+            max_files: 100_000,
+            max_file_bytes: 1 << 30,
+            archive: ArchiveLimits::default(),
+        }
+    }
+}
+
+/// Settings of `multistage serve`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ServerConfig {
+    /// Address to listen on; port 0 takes a free one.
+    pub bind: SocketAddr,
+    /// Where everything is kept.
+    pub data_dir: PathBuf,
+    /// Worker threads of a job.
+    pub threads: usize,
+    /// Jobs that run at once.
+    pub parallel_jobs: usize,
+    /// Seed of every job's run.
+    pub seed: u64,
+    /// What uploads may bring.
+    pub uploads: UploadLimits,
+    /// Time for a request other than uploads, downloads and event streams.
+    pub request_timeout: Duration,
+    /// An upload that brings no byte for so long is given up.
+    pub upload_idle_timeout: Duration,
+    /// How often event streams say that they live.
+    pub keep_alive: Duration,
+    /// Time for requests and jobs to end when the service stops.
+    pub shutdown_grace: Duration,
+}
+
+impl ServerConfig {
+    /// The defaults, for a data directory.
+    pub fn new(data_dir: &Path) -> Self {
+        Self {
+            bind: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080),
+            data_dir: data_dir.to_path_buf(),
+            threads: std::thread::available_parallelism().map_or(1, usize::from),
+            parallel_jobs: 1,
+            seed: 0,
+            uploads: UploadLimits::default(),
+            request_timeout: Duration::from_secs(30),
+            upload_idle_timeout: Duration::from_secs(60),
+            keep_alive: Duration::from_secs(15),
+            shutdown_grace: Duration::from_secs(10),
+        }
+    }
+
+    /// Small limits, short times and any free port.
+    pub fn for_testing(data_dir: &Path) -> Self {
+        Self {
+            bind: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
+            threads: 2,
+            uploads: UploadLimits {
+                max_upload_bytes: 64 << 20,
+                max_files: 5_000,
+                max_file_bytes: 4 << 20,
+                archive: ArchiveLimits { max_entries: 2_000, max_file_bytes: 4 << 20, ..ArchiveLimits::default() },
+            },
+            upload_idle_timeout: Duration::from_secs(5),
+            keep_alive: Duration::from_millis(200),
+            ..Self::new(data_dir)
+        }
+    }
+}

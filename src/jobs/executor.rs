@@ -1,0 +1,311 @@
+//! The executor: takes jobs out of the queue and runs each to its end on a thread of its own.
+//!
+//! One [`tick`](Executor::tick):
+//! 1. claim the job that has waited longest; none: [`Tick::Idle`];
+//! 2. check that its photographs are the ones it was queued with;
+//! 3. run the engine on a fresh thread, a panic caught, while progress goes into the database;
+//! 4. publish the outputs, then commit verdicts, models and the final state in one transaction.
+//!
+//! A crash at any moment leaves the job `running`; the next start queues it again, and the engine goes on from its artifacts.
+
+use std::any::Any;
+use std::collections::BTreeMap;
+use std::panic::AssertUnwindSafe;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::{oneshot, watch};
+use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
+
+use super::progress::{Progress, Recorder, WRITE_INTERVAL, WatchSink};
+use super::queue::{job_id, transition};
+use super::view::ErrorView;
+use super::{JobState, Jobs, RunPaths, publish};
+use crate::formats::report::Report;
+use crate::pipeline::{Context, PipelineError};
+use crate::store::db::job_outputs::JobOutputRow;
+use crate::store::db::jobs::JobRow;
+use crate::store::db::{job_images, job_outputs, jobs};
+use crate::store::{StoreError, atomic};
+
+/// The idle executor looks into the queue so often even if nobody wakes it.
+const IDLE_POLL: Duration = Duration::from_secs(5);
+/// Between attempts to store a job's end while the database refuses, for instance because the disk is full.
+const STORE_RETRY: Duration = Duration::from_secs(2);
+/// Stack of a job's thread; the engine's recursion is shallow, but matrices on the stack are not.
+const STACK_BYTES: usize = 16 << 20;
+
+/// What one tick did.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tick {
+    /// The queue is empty.
+    Idle,
+    /// A job ran and is now in this state.
+    Ran(Uuid, JobState),
+}
+
+/// Runs jobs.
+#[derive(Clone)]
+pub struct Executor {
+    /// Which.
+    pub jobs: Jobs,
+    /// Worker threads of a job.
+    pub threads: usize,
+    /// Seed of every run.
+    pub seed: u64,
+}
+
+/// How a run ended.
+enum Outcome {
+    Report(Box<Report>),
+    Cancelled,
+    Failed(ErrorView),
+}
+
+impl Executor {
+    /// Runs jobs, `parallel` at once, until `shutdown`; returns once the running ones stopped.
+    pub async fn run(self, parallel: usize, shutdown: CancellationToken) {
+        let lanes: Vec<_> = (0..parallel.max(1))
+            .map(|_| {
+                let (executor, shutdown) = (self.clone(), shutdown.clone());
+                tokio::spawn(async move { executor.lane(&shutdown).await })
+            })
+            .collect();
+        shutdown.cancelled().await;
+        self.jobs.hub.stop();
+        for lane in lanes {
+            if let Err(error) = lane.await {
+                tracing::error!(%error, "an executor lane panicked");
+            }
+        }
+    }
+
+    async fn lane(&self, shutdown: &CancellationToken) {
+        while !shutdown.is_cancelled() {
+            let pause = match self.tick().await {
+                Ok(Tick::Ran(..)) => continue,
+                Ok(Tick::Idle) => IDLE_POLL,
+                Err(error) => {
+                    tracing::error!(%error, "the queue can't be read");
+                    STORE_RETRY
+                }
+            };
+            tokio::select! {
+                () = self.jobs.hub.woken() => {}
+                () = tokio::time::sleep(pause) => {}
+                () = shutdown.cancelled() => {}
+            }
+        }
+    }
+
+    /// Runs the next job, if there is one, to its end.
+    ///
+    /// # Errors
+    /// When the queue can't be read.
+    pub async fn tick(&self) -> Result<Tick, StoreError> {
+        let Some(row) = self.jobs.claim().await? else { return Ok(Tick::Idle) };
+        let id = job_id(&row)?;
+        tracing::info!(job = %id, "job started");
+        let outcome = match self.check_input(&row).await {
+            Ok(()) => self.run_engine(id, &row).await,
+            Err(error) => Outcome::Failed(error),
+        };
+        self.jobs.hub.ended(id);
+        let state = self.finish(id, outcome).await;
+        tracing::info!(job = %id, %state, "job ended");
+        Ok(Tick::Ran(id, state))
+    }
+
+    /// Compares the dataset's folder with the job's list: a file without a row was never acknowledged and goes; a row without its
+    /// file ends the job.
+    async fn check_input(&self, row: &JobRow) -> Result<(), ErrorView> {
+        let failed = |message: String| ErrorView { stage: None, code: "input_missing".to_owned(), message };
+        let check = async {
+            let (job, dataset) = (job_id(row)?, row.dataset_id.parse::<Uuid>().map_err(|_| StoreError::NotFound)?);
+            let images = job_images::list(self.jobs.store.db.reader(), job, None, -1, u32::MAX).await?;
+            let mut expected: BTreeMap<String, i64> =
+                images.into_iter().map(|image| (image.path, image.size_bytes)).collect();
+            let folder = self.jobs.store.data.images(dataset);
+            let check = move || -> Result<Option<String>, StoreError> {
+                for path in atomic::list_files(&folder)? {
+                    let file = folder.join(&path);
+                    match expected.remove(&path) {
+                        Some(size) if i64::try_from(file.metadata()?.len()) == Ok(size) => {}
+                        Some(_) => return Ok(Some(path)),
+                        None => std::fs::remove_file(file)?,
+                    }
+                }
+                Ok(expected.into_keys().next())
+            };
+            tokio::task::spawn_blocking(check).await.map_err(std::io::Error::other)?
+        };
+        match check.await {
+            Ok(None) => Ok(()),
+            Ok(Some(path)) => Err(failed(format!("the photograph {path:?} is missing or damaged in the store"))),
+            Err(error) => Err(failed(error.to_string())),
+        }
+    }
+
+    async fn run_engine(&self, id: Uuid, row: &JobRow) -> Outcome {
+        let hub = &self.jobs.hub;
+        let cancel = hub.started(id);
+        // Somebody may have asked between the claim and the flag's birth.
+        if let Ok(Some(now)) = jobs::find(self.jobs.store.db.reader(), id).await
+            && now.cancel_requested
+        {
+            cancel.cancel();
+        }
+        let (progress_in, mut progress) = watch::channel(Progress::default());
+        let context =
+            Context { seed: self.seed, threads: self.threads, cancel, progress: Arc::new(WatchSink(progress_in)) };
+        let mut finished = match self.spawn(id, row, context) {
+            Ok(finished) => finished,
+            Err(error) => {
+                let message = format!("the job could not be started: {error}");
+                return Outcome::Failed(ErrorView { stage: None, code: "io_error".to_owned(), message });
+            }
+        };
+        let mut recorder = Recorder::new(id);
+        let mut telling = true;
+        let result = loop {
+            tokio::select! {
+                result = &mut finished => break result,
+                changed = progress.changed(), if telling => telling = changed.is_ok(),
+            }
+            let now = progress.borrow_and_update().clone();
+            if let Err(error) = recorder.write(&self.jobs.store.db, hub, now).await {
+                tracing::warn!(job = %id, %error, "progress could not be stored");
+            }
+            if let Ok(result) = tokio::time::timeout(WRITE_INTERVAL, &mut finished).await {
+                break result;
+            }
+        };
+        let last = progress.borrow().clone();
+        let stage = last.current();
+        if let Err(error) = recorder.write(&self.jobs.store.db, hub, last).await {
+            tracing::warn!(job = %id, %error, "progress could not be stored");
+        }
+        match result {
+            Ok(Ok(Ok(report))) => Outcome::Report(Box::new(report)),
+            Ok(Ok(Err(PipelineError::Cancelled))) => Outcome::Cancelled,
+            Ok(Ok(Err(error))) => {
+                Outcome::Failed(ErrorView { stage, code: error.code().to_owned(), message: error.to_string() })
+            }
+            Ok(Err(panic)) => {
+                let message = format!("the engine panicked: {}", panic_message(&*panic));
+                Outcome::Failed(ErrorView { stage, code: "panic".to_owned(), message })
+            }
+            Err(_) => {
+                let message = "the job's thread ended without a word".to_owned();
+                Outcome::Failed(ErrorView { stage, code: "internal_error".to_owned(), message })
+            }
+        }
+    }
+
+    /// Starts the engine on a thread of its own.
+    fn spawn(&self, id: Uuid, row: &JobRow, context: Context) -> Result<oneshot::Receiver<EngineResult>, StoreError> {
+        let data = &self.jobs.store.data;
+        let dataset = row.dataset_id.parse().map_err(|_| StoreError::NotFound)?;
+        let paths = RunPaths { images_dir: data.images(dataset), out_dir: data.partial(id), work_dir: data.work(id) };
+        std::fs::create_dir_all(&paths.work_dir)?;
+        atomic::empty_dir(&paths.out_dir)?;
+        let options = serde_json::from_str(&row.options).unwrap_or_default();
+        let engine = Arc::clone(&self.jobs.engine);
+        let (sender, receiver) = oneshot::channel();
+        std::thread::Builder::new().name(format!("job-{id}")).stack_size(STACK_BYTES).spawn(move || {
+            let run = AssertUnwindSafe(|| engine.run(&paths, &options, &context));
+            let result = std::panic::catch_unwind(run);
+            drop(context);
+            // Nobody listens any more only when the process ends.
+            let _ = sender.send(result);
+        })?;
+        Ok(receiver)
+    }
+
+    /// Stores how a job ended, again and again until the store takes it or the process ends.
+    async fn finish(&self, id: Uuid, outcome: Outcome) -> JobState {
+        let mut outputs = None;
+        loop {
+            match self.try_finish(id, &outcome, &mut outputs).await {
+                Ok(state) => {
+                    self.jobs.hub.announce();
+                    self.forget_work(id, state).await;
+                    return state;
+                }
+                Err(error) => tracing::error!(job = %id, %error, "the end of a job could not be stored"),
+            }
+            if self.jobs.hub.is_stopping() {
+                return JobState::Running;
+            }
+            tokio::time::sleep(STORE_RETRY).await;
+        }
+    }
+
+    /// One attempt. `outputs` keeps what was published, because that can be done only once.
+    async fn try_finish(
+        &self,
+        id: Uuid,
+        outcome: &Outcome,
+        outputs: &mut Option<Vec<JobOutputRow>>,
+    ) -> Result<JobState, StoreError> {
+        let store = &self.jobs.store;
+        if matches!(outcome, Outcome::Report(_)) && outputs.is_none() {
+            let store = Arc::clone(store);
+            let publish = tokio::task::spawn_blocking(move || publish::publish(&store.data, id));
+            *outputs = Some(publish.await.map_err(std::io::Error::other)??);
+        }
+        let mut tx = store.db.write().await?;
+        if let Some(outputs) = outputs {
+            job_outputs::replace(&mut tx, id, outputs).await?;
+        }
+        let mut row = jobs::find(&mut *tx, id).await?.ok_or(StoreError::NotFound)?;
+        let (state, error) = match outcome {
+            Outcome::Report(report) => {
+                row.models = Some(publish::models_json(report));
+                publish::write_verdicts(&mut tx, id, report).await?;
+                if report.models.is_empty() {
+                    (JobState::Failed, Some(no_model(report)))
+                } else {
+                    (JobState::Succeeded, None)
+                }
+            }
+            // The process ends: the job goes on after the next start.
+            Outcome::Cancelled if self.jobs.hub.is_stopping() && !row.cancel_requested => (JobState::Queued, None),
+            Outcome::Cancelled => (JobState::Cancelled, None),
+            Outcome::Failed(error) => (JobState::Failed, Some(error.clone())),
+        };
+        transition(&mut tx, &mut row, state, error).await?;
+        tx.commit().await?;
+        Ok(state)
+    }
+
+    /// Removes what a run would have gone on from, once it serves nobody.
+    async fn forget_work(&self, id: Uuid, state: JobState) {
+        if state != JobState::Succeeded {
+            return;
+        }
+        let (store, work) = (Arc::clone(&self.jobs.store), self.jobs.store.data.work(id));
+        match tokio::task::spawn_blocking(move || store.data.discard(&work)).await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => tracing::warn!(job = %id, %error, "the work folder could not be removed"),
+            Err(error) => tracing::error!(job = %id, %error, "removing the work folder panicked"),
+        }
+    }
+}
+
+type EngineResult = Result<Result<Report, PipelineError>, Box<dyn Any + Send>>;
+
+fn no_model(report: &Report) -> ErrorView {
+    let examined = report.images.len();
+    let message = format!(
+        "no model could be made of the {examined} photographs; the report says for each what happened and what may help"
+    );
+    let stage = report.stages.iter().map(|stage| stage.name.as_str()).find(|name| *name == "coarse_model");
+    ErrorView { stage: stage.map(str::to_owned), code: "no_model".to_owned(), message }
+}
+
+fn panic_message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<&str>().copied();
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("no message")
+}

@@ -1,0 +1,289 @@
+//! What may be done with jobs from outside: enqueue, cancel, resume, delete. Every move is one transaction, and each change of
+//! state is an event.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use sqlx::SqliteConnection;
+use uuid::Uuid;
+
+use super::view::{ErrorView, StateEvent, time_text};
+use super::{Engine, Hub, JobState};
+use crate::store::db::jobs::{JobRow, NewJobRow};
+use crate::store::db::{dataset_images, datasets, job_events, job_images, job_outputs, job_stages, jobs, now_ms};
+use crate::store::{Store, StoreError};
+
+/// Letters of a job's name.
+pub const MAX_NAME_CHARS: usize = 200;
+
+/// The jobs of a store.
+#[derive(Clone)]
+pub struct Jobs {
+    /// Where they are kept.
+    pub store: Arc<Store>,
+    /// Who must hear of changes.
+    pub hub: Arc<Hub>,
+    /// Who runs them.
+    pub engine: Arc<dyn Engine>,
+}
+
+/// What to reconstruct.
+#[derive(Clone, Debug)]
+pub struct NewJob {
+    /// Its id, a fresh one.
+    pub id: Uuid,
+    /// For people; the dataset's name when empty.
+    pub name: String,
+    /// Its photographs.
+    pub dataset: Uuid,
+    /// What the engine takes.
+    pub options: serde_json::Value,
+    /// Files of its own upload that were no photographs.
+    pub ignored: Option<usize>,
+}
+
+/// Why a move was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum JobsError {
+    /// There is no such job.
+    #[error("there is no such job")]
+    JobNotFound,
+    /// There is no such dataset.
+    #[error("there is no such dataset")]
+    DatasetNotFound,
+    /// The dataset is empty.
+    #[error("there are no photographs")]
+    NoImages,
+    /// The name is too long.
+    #[error("a name has at most {MAX_NAME_CHARS} letters")]
+    InvalidName,
+    /// The engine refuses the options.
+    #[error("invalid options: {}", .0.join("; "))]
+    InvalidOptions(Vec<String>),
+    /// It runs.
+    #[error("the job is running; cancel it first")]
+    Running,
+    /// It is over.
+    #[error("the job is over: {0}")]
+    NotActive(JobState),
+    /// It is not over, or succeeded.
+    #[error("only a failed or cancelled job can be resumed; this one is {0}")]
+    NotResumable(JobState),
+    /// What the store said.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+impl From<sqlx::Error> for JobsError {
+    fn from(error: sqlx::Error) -> Self {
+        Self::Store(error.into())
+    }
+}
+
+/// A job's id out of a row, which was written from one.
+pub(super) fn job_id(row: &JobRow) -> Result<Uuid, StoreError> {
+    row.id.parse().map_err(|_| sqlx::Error::Decode(format!("{:?} is no id", row.id).into()).into())
+}
+
+/// The state of a row; the table takes no other names.
+pub fn state_of(row: &JobRow) -> JobState {
+    JobState::parse(&row.state).unwrap_or(JobState::Failed)
+}
+
+/// Moves a job to another state: row and event.
+pub(super) async fn transition(
+    tx: &mut SqliteConnection,
+    row: &mut JobRow,
+    next: JobState,
+    error: Option<ErrorView>,
+) -> Result<(), StoreError> {
+    let id = job_id(row)?;
+    let now = now_ms();
+    debug_assert!(state_of(row).may_become(next), "{} -> {next}", row.state);
+    row.state = next.as_str().to_owned();
+    if next == JobState::Running {
+        row.started_ms = Some(now);
+    }
+    row.finished_ms = next.is_final().then_some(now);
+    if next != JobState::Running {
+        row.cancel_requested = false;
+    }
+    let event = StateEvent { state: next, at: time_text(now), error };
+    row.error_stage = event.error.as_ref().and_then(|error| error.stage.clone());
+    row.error_code = event.error.as_ref().map(|error| error.code.clone());
+    row.error_message = event.error.as_ref().map(|error| error.message.clone());
+    jobs::update_state(tx, row).await?;
+    let data = serde_json::to_string(&event).map_err(|error| sqlx::Error::Encode(error.into()))?;
+    job_events::append(tx, id, "state", &data).await?;
+    Ok(())
+}
+
+impl Jobs {
+    /// One job.
+    ///
+    /// # Errors
+    /// [`JobsError::JobNotFound`], or what the store said.
+    pub async fn find(&self, id: Uuid) -> Result<JobRow, JobsError> {
+        jobs::find(self.store.db.reader(), id).await?.ok_or(JobsError::JobNotFound)
+    }
+
+    /// Whether a name and options would be taken.
+    ///
+    /// # Errors
+    /// Why not.
+    pub fn check(&self, name: &str, options: &serde_json::Value) -> Result<(), JobsError> {
+        if name.chars().count() > MAX_NAME_CHARS {
+            return Err(JobsError::InvalidName);
+        }
+        self.engine.validate(options).map_err(JobsError::InvalidOptions)
+    }
+
+    /// Queues a new job on the photographs that the dataset holds now.
+    ///
+    /// # Errors
+    /// Why not.
+    pub async fn enqueue(&self, new: NewJob) -> Result<JobRow, JobsError> {
+        self.check(&new.name, &new.options)?;
+        let mut tx = self.store.db.write().await?;
+        let Some(dataset) = datasets::find(&mut *tx, new.dataset).await? else {
+            return Err(JobsError::DatasetNotFound);
+        };
+        if dataset_images::list(&mut *tx, new.dataset, "", 1).await?.is_empty() {
+            return Err(JobsError::NoImages);
+        }
+        let now = now_ms();
+        let row = NewJobRow {
+            id: new.id,
+            name: if new.name.is_empty() { dataset.name } else { new.name },
+            created_ms: now,
+            dataset: new.dataset,
+            options: new.options.to_string(),
+            ignored: new.ignored.map(|n| i64::try_from(n).unwrap_or(i64::MAX)),
+        };
+        jobs::insert(&mut tx, &row).await?;
+        job_images::freeze(&mut tx, new.id, new.dataset).await?;
+        let event = StateEvent { state: JobState::Queued, at: time_text(now), error: None };
+        let data = serde_json::to_string(&event).map_err(|error| sqlx::Error::Encode(error.into()))?;
+        job_events::append(&mut tx, new.id, "state", &data).await?;
+        let row = jobs::find(&mut *tx, new.id).await?.ok_or(JobsError::JobNotFound)?;
+        tx.commit().await?;
+        self.hub.announce();
+        self.hub.wake_executor();
+        Ok(row)
+    }
+
+    /// Takes the job that has waited longest out of the queue and marks it running.
+    pub(super) async fn claim(&self) -> Result<Option<JobRow>, StoreError> {
+        let mut tx = self.store.db.write().await?;
+        let Some(mut row) = jobs::next_queued(&mut tx).await? else { return Ok(None) };
+        job_stages::clear(&mut tx, job_id(&row)?).await?;
+        transition(&mut tx, &mut row, JobState::Running, None).await?;
+        tx.commit().await?;
+        self.hub.announce();
+        Ok(Some(row))
+    }
+
+    /// Stops a queued job at once, asks a running one to stop; no error for one that is cancelled.
+    ///
+    /// # Errors
+    /// [`JobsError::NotActive`] for a job that succeeded or failed.
+    pub async fn cancel(&self, id: Uuid) -> Result<JobRow, JobsError> {
+        let mut tx = self.store.db.write().await?;
+        let mut row = jobs::find(&mut *tx, id).await?.ok_or(JobsError::JobNotFound)?;
+        match state_of(&row) {
+            JobState::Queued => transition(&mut tx, &mut row, JobState::Cancelled, None).await?,
+            JobState::Running => {
+                row.cancel_requested = true;
+                jobs::update_state(&mut tx, &row).await?;
+            }
+            JobState::Cancelled => {}
+            over => return Err(JobsError::NotActive(over)),
+        }
+        tx.commit().await?;
+        self.hub.cancel(id);
+        self.hub.announce();
+        Ok(row)
+    }
+
+    /// Queues a failed or cancelled job again; finished stages are re-used.
+    ///
+    /// # Errors
+    /// [`JobsError::NotResumable`] in any other state.
+    pub async fn resume(&self, id: Uuid) -> Result<JobRow, JobsError> {
+        let mut tx = self.store.db.write().await?;
+        let mut row = jobs::find(&mut *tx, id).await?.ok_or(JobsError::JobNotFound)?;
+        let state = state_of(&row);
+        if !state.may_become(JobState::Queued) || !state.is_final() {
+            return Err(JobsError::NotResumable(state));
+        }
+        let dataset = row.dataset_id.parse().map_err(|_| JobsError::DatasetNotFound)?;
+        row.interruptions = 0;
+        row.models = None;
+        row.started_ms = None;
+        job_images::freeze(&mut tx, id, dataset).await?;
+        job_stages::clear(&mut tx, id).await?;
+        job_outputs::replace(&mut tx, id, &[]).await?;
+        transition(&mut tx, &mut row, JobState::Queued, None).await?;
+        tx.commit().await?;
+        self.hub.announce();
+        self.hub.wake_executor();
+        Ok(row)
+    }
+
+    /// Deletes a job that does not run, its files, and its dataset when its own upload made it and no other job uses it.
+    ///
+    /// # Errors
+    /// [`JobsError::Running`].
+    pub async fn delete(&self, id: Uuid) -> Result<(), JobsError> {
+        let mut tx = self.store.db.write().await?;
+        let row = jobs::find(&mut *tx, id).await?.ok_or(JobsError::JobNotFound)?;
+        if state_of(&row) == JobState::Running {
+            return Err(JobsError::Running);
+        }
+        let own: Option<Uuid> = datasets::owned_only_by(&mut tx, id).await?.and_then(|dataset| dataset.parse().ok());
+        jobs::delete(&mut tx, id).await?;
+        match own {
+            Some(dataset) => {
+                datasets::delete(&mut tx, dataset).await?;
+            }
+            None => datasets::release_owner(&mut tx, id).await?,
+        }
+        tx.commit().await?;
+        self.hub.announce();
+        let folders = own.map(|dataset| self.store.data.dataset(dataset)).into_iter();
+        self.discard(folders.chain([self.store.data.job(id)]).collect()).await;
+        Ok(())
+    }
+
+    /// Deletes a dataset that no job refers to.
+    ///
+    /// # Errors
+    /// [`StoreError::DatasetInUse`].
+    pub async fn delete_dataset(&self, id: Uuid) -> Result<(), JobsError> {
+        let mut tx = self.store.db.write().await?;
+        if jobs::use_of_dataset(&mut tx, id).await?.0 {
+            return Err(StoreError::DatasetInUse.into());
+        }
+        if !datasets::delete(&mut tx, id).await? {
+            return Err(JobsError::DatasetNotFound);
+        }
+        tx.commit().await?;
+        self.discard(vec![self.store.data.dataset(id)]).await;
+        Ok(())
+    }
+
+    /// Removes folders whose rows are gone. Failing that costs space, no more: it is told to the log.
+    async fn discard(&self, folders: Vec<PathBuf>) {
+        let store = Arc::clone(&self.store);
+        let removal = tokio::task::spawn_blocking(move || {
+            for folder in folders {
+                if let Err(error) = store.data.discard(&folder) {
+                    tracing::warn!(folder = %folder.display(), %error, "a deleted folder could not be removed");
+                }
+            }
+        });
+        if let Err(error) = removal.await {
+            tracing::error!(%error, "removing folders panicked");
+        }
+    }
+}
