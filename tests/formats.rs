@@ -1,6 +1,8 @@
-//! Formats seen from outside: photographs of every kind and oddity.
+//! Formats seen from outside.
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "formats/models.rs"]
+mod models;
 #[path = "formats/photographs.rs"]
 mod photographs;

@@ -1,5 +1,11 @@
 //! Bytes to domain types and back, over `Read` and `Write`: no paths, no policy.
 
+pub mod bundler;
+pub mod colmap;
+mod error;
 pub mod exif;
 pub mod photograph;
+pub mod ply;
 pub mod report;
+
+pub use error::FormatError;
