@@ -71,6 +71,13 @@ impl StagedWriter {
     }
 }
 
+impl StagedFile {
+    /// Where its bytes lie now.
+    pub fn staged_at(&self) -> &Path {
+        &self.file
+    }
+}
+
 /// What became of a batch.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Committed {

@@ -1,0 +1,232 @@
+//! Errors as RFC 9457 problems. A handler returns a [`Problem`]; the outermost layer writes the body, because it knows the
+//! request's id, and turns every other error answer into a problem too, so that a client meets no second format.
+
+use axum::body::Body;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+
+use crate::jobs::JobsError;
+use crate::store::{ArchiveError, InvalidFileName, StoreError};
+
+/// Defines the codes with their status, in the order of `openapi.yaml`.
+macro_rules! codes {
+    ($($variant:ident $name:literal $status:ident),+ $(,)?) => {
+        /// The stable name of a problem.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub enum Code {
+            $(#[doc = concat!("`", $name, "`")] $variant,)+
+        }
+
+        impl Code {
+            /// Every code.
+            pub const ALL: &[Self] = &[$(Self::$variant),+];
+
+            /// The name on the wire.
+            pub fn as_str(self) -> &'static str {
+                match self { $(Self::$variant => $name),+ }
+            }
+
+            /// The status that goes with it.
+            pub fn status(self) -> StatusCode {
+                match self { $(Self::$variant => StatusCode::$status),+ }
+            }
+        }
+    };
+}
+
+codes! {
+    BadRequest "bad_request" BAD_REQUEST,
+    InvalidJson "invalid_json" BAD_REQUEST,
+    InvalidMultipart "invalid_multipart" BAD_REQUEST,
+    InvalidQuery "invalid_query" BAD_REQUEST,
+    NotFound "not_found" NOT_FOUND,
+    JobNotFound "job_not_found" NOT_FOUND,
+    DatasetNotFound "dataset_not_found" NOT_FOUND,
+    ImageNotFound "image_not_found" NOT_FOUND,
+    OutputNotFound "output_not_found" NOT_FOUND,
+    MethodNotAllowed "method_not_allowed" METHOD_NOT_ALLOWED,
+    RequestTimeout "request_timeout" REQUEST_TIMEOUT,
+    FileConflict "file_conflict" CONFLICT,
+    DatasetInUse "dataset_in_use" CONFLICT,
+    JobRunning "job_running" CONFLICT,
+    JobNotActive "job_not_active" CONFLICT,
+    JobNotResumable "job_not_resumable" CONFLICT,
+    PayloadTooLarge "payload_too_large" PAYLOAD_TOO_LARGE,
+    TooManyFiles "too_many_files" PAYLOAD_TOO_LARGE,
+    ArchiveTooLarge "archive_too_large" PAYLOAD_TOO_LARGE,
+    UnsupportedMediaType "unsupported_media_type" UNSUPPORTED_MEDIA_TYPE,
+    RangeNotSatisfiable "range_not_satisfiable" RANGE_NOT_SATISFIABLE,
+    InvalidFileName "invalid_file_name" UNPROCESSABLE_ENTITY,
+    InvalidArchive "invalid_archive" UNPROCESSABLE_ENTITY,
+    InvalidName "invalid_name" UNPROCESSABLE_ENTITY,
+    InvalidOptions "invalid_options" UNPROCESSABLE_ENTITY,
+    NoImages "no_images" UNPROCESSABLE_ENTITY,
+    ThumbnailUnavailable "thumbnail_unavailable" UNPROCESSABLE_ENTITY,
+    InternalError "internal_error" INTERNAL_SERVER_ERROR,
+    NotReady "not_ready" SERVICE_UNAVAILABLE,
+    DiskFull "disk_full" INSUFFICIENT_STORAGE,
+}
+
+/// What went wrong.
+#[derive(Clone, Debug)]
+pub struct Problem {
+    code: Code,
+    detail: Option<String>,
+    errors: Vec<String>,
+    path: Option<String>,
+}
+
+/// The body.
+#[derive(Serialize)]
+struct Envelope<'a> {
+    r#type: &'static str,
+    title: &'static str,
+    status: u16,
+    code: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    detail: Option<&'a str>,
+    request_id: &'a str,
+    #[serde(skip_serializing_if = "<[_]>::is_empty")]
+    errors: &'a [String],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    path: Option<&'a str>,
+}
+
+impl Problem {
+    /// A problem without further words.
+    pub fn new(code: Code) -> Self {
+        Self { code, detail: None, errors: Vec::new(), path: None }
+    }
+
+    /// Adds a sentence for people.
+    pub fn detail(mut self, detail: impl ToString) -> Self {
+        self.detail = Some(detail.to_string());
+        self
+    }
+
+    /// Names the file it is about.
+    pub fn path(mut self, path: impl ToString) -> Self {
+        self.path = Some(path.to_string());
+        self
+    }
+
+    /// Lists single violations.
+    fn errors(mut self, errors: Vec<String>) -> Self {
+        self.errors = errors;
+        self
+    }
+
+    /// Logs what happened inside and says no more than that it did.
+    pub fn internal(error: &dyn std::fmt::Display) -> Self {
+        tracing::error!(%error, "a request failed inside");
+        Self::new(Code::InternalError)
+    }
+
+    /// A name that was refused.
+    pub fn file_name(name: &str, why: InvalidFileName) -> Self {
+        Self::new(Code::InvalidFileName).detail(why).path(name)
+    }
+
+    /// The problem that an error answer of the framework stands for.
+    pub(super) fn of_status(status: StatusCode) -> Self {
+        Self::new(match status {
+            StatusCode::NOT_FOUND => Code::NotFound,
+            StatusCode::METHOD_NOT_ALLOWED => Code::MethodNotAllowed,
+            StatusCode::REQUEST_TIMEOUT => Code::RequestTimeout,
+            StatusCode::PAYLOAD_TOO_LARGE => Code::PayloadTooLarge,
+            StatusCode::UNSUPPORTED_MEDIA_TYPE => Code::UnsupportedMediaType,
+            StatusCode::RANGE_NOT_SATISFIABLE => Code::RangeNotSatisfiable,
+            StatusCode::SERVICE_UNAVAILABLE => Code::NotReady,
+            status if status.is_client_error() => Code::BadRequest,
+            _ => Code::InternalError,
+        })
+    }
+
+    /// Writes the problem into an answer, whose other headers stay.
+    pub(super) fn write(&self, response: &mut Response, request_id: &str) {
+        let status = self.code.status();
+        let envelope = Envelope {
+            r#type: "about:blank",
+            title: status.canonical_reason().unwrap_or("Error"),
+            status: status.as_u16(),
+            code: self.code.as_str(),
+            detail: self.detail.as_deref(),
+            request_id,
+            errors: &self.errors,
+            path: self.path.as_deref(),
+        };
+        *response.status_mut() = status;
+        *response.body_mut() = Body::from(serde_json::to_vec(&envelope).unwrap_or_default());
+        let headers = response.headers_mut();
+        headers.remove(header::CONTENT_LENGTH);
+        headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let mut response = self.code.status().into_response();
+        response.extensions_mut().insert(self);
+        response
+    }
+}
+
+impl From<StoreError> for Problem {
+    fn from(error: StoreError) -> Self {
+        if error.is_disk_full() {
+            return Self::new(Code::DiskFull).detail("the disk is full");
+        }
+        match error {
+            StoreError::FileConflict(path) => {
+                Self::new(Code::FileConflict).detail("the path is stored already with other bytes").path(path)
+            }
+            StoreError::DatasetInUse => Self::new(Code::DatasetInUse).detail(error),
+            StoreError::NotFound => Self::new(Code::DatasetNotFound),
+            StoreError::Io(_) | StoreError::Db(_) => Self::internal(&error),
+        }
+    }
+}
+
+impl From<std::io::Error> for Problem {
+    fn from(error: std::io::Error) -> Self {
+        StoreError::from(error).into()
+    }
+}
+
+impl From<sqlx::Error> for Problem {
+    fn from(error: sqlx::Error) -> Self {
+        StoreError::from(error).into()
+    }
+}
+
+impl From<JobsError> for Problem {
+    fn from(error: JobsError) -> Self {
+        let code = match error {
+            JobsError::Store(error) => return error.into(),
+            JobsError::InvalidOptions(errors) => {
+                return Self::new(Code::InvalidOptions).detail("the options can't be used").errors(errors);
+            }
+            JobsError::JobNotFound => Code::JobNotFound,
+            JobsError::DatasetNotFound => Code::DatasetNotFound,
+            JobsError::NoImages => Code::NoImages,
+            JobsError::InvalidName => Code::InvalidName,
+            JobsError::Running => Code::JobRunning,
+            JobsError::NotActive(_) => Code::JobNotActive,
+            JobsError::NotResumable(_) => Code::JobNotResumable,
+        };
+        Self::new(code).detail(error)
+    }
+}
+
+impl From<ArchiveError> for Problem {
+    fn from(error: ArchiveError) -> Self {
+        match error {
+            ArchiveError::Store(error) => error.into(),
+            ArchiveError::FileName(name, why) => Self::file_name(&name, why),
+            ArchiveError::Invalid(_) => Self::new(Code::InvalidArchive).detail(error),
+            ArchiveError::TooLarge(_) => Self::new(Code::ArchiveTooLarge).detail(error),
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! Jobs: make, list, look at, cancel, resume, delete.
+
+use axum::Router;
+use axum::extract::{FromRequest, Multipart, Request, State};
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use serde::Deserialize;
+use uuid::Uuid;
+
+use crate::http::extract::{JobId, Json, Page, Query, cut, media_type};
+use crate::http::problem::{Code, Problem};
+use crate::http::upload::{Received, receive};
+use crate::http::{AppState, wire};
+use crate::jobs::{Jobs, NewJob};
+use crate::store::db::jobs::JobRow;
+use crate::store::db::{datasets, job_images, job_stages, jobs, now_ms};
+
+/// Quick requests.
+pub(in crate::http) fn router() -> Router<AppState> {
+    Router::new()
+        .route("/api/v1/jobs", get(list))
+        .route("/api/v1/jobs/{job_id}", get(show).delete(delete))
+        .route("/api/v1/jobs/{job_id}/cancel", post(cancel))
+        .route("/api/v1/jobs/{job_id}/resume", post(resume))
+}
+
+/// Requests that may take long.
+pub(in crate::http) fn upload_router() -> Router<AppState> {
+    Router::new().route("/api/v1/jobs", post(create))
+}
+
+/// A job as it is shown.
+pub(in crate::http) async fn view(state: &AppState, row: JobRow) -> Result<wire::Job, Problem> {
+    let reader = state.jobs.store.db.reader();
+    let id: Uuid = row.id.parse().map_err(|error| Problem::internal(&error))?;
+    let stages = job_stages::list(reader, id).await?;
+    let images = job_images::counts(reader, id).await?;
+    Ok(wire::Job::new(row, &stages, images))
+}
+
+async fn list(State(state): State<AppState>, Query(page): Query<Page>) -> Result<Response, Problem> {
+    let limit = page.limit()?;
+    let mut rows = jobs::list(state.jobs.store.db.reader(), page.number_or(i64::MAX)?, limit + 1).await?;
+    let more = cut(&mut rows, limit);
+    let next_cursor = rows.last().filter(|_| more).map(|row| row.seq.to_string());
+    let mut shown = Vec::with_capacity(rows.len());
+    for row in rows {
+        shown.push(view(&state, row).await?);
+    }
+    Ok(axum::Json(wire::JobPage { jobs: shown, next_cursor }).into_response())
+}
+
+async fn show(State(state): State<AppState>, JobId(id): JobId) -> Result<Response, Problem> {
+    let row = state.jobs.find(id).await?;
+    Ok(axum::Json(view(&state, row).await?).into_response())
+}
+
+async fn delete(State(state): State<AppState>, JobId(id): JobId) -> Result<StatusCode, Problem> {
+    state.jobs.delete(id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+async fn cancel(State(state): State<AppState>, JobId(id): JobId) -> Result<Response, Problem> {
+    let row = state.jobs.cancel(id).await?;
+    Ok((StatusCode::ACCEPTED, axum::Json(view(&state, row).await?)).into_response())
+}
+
+async fn resume(State(state): State<AppState>, JobId(id): JobId) -> Result<Response, Problem> {
+    let row = state.jobs.resume(id).await?;
+    Ok((StatusCode::ACCEPTED, axum::Json(view(&state, row).await?)).into_response())
+}
+
+/// The JSON body of a new job.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NewJobBody {
+    dataset_id: Uuid,
+    #[serde(default)]
+    name: String,
+    options: Option<serde_json::Map<String, serde_json::Value>>,
+}
+
+async fn create(State(state): State<AppState>, request: Request) -> Result<Response, Problem> {
+    let row = match media_type(request.headers()).as_str() {
+        "multipart/form-data" => {
+            let multipart = Multipart::from_request(request, &state)
+                .await
+                .map_err(|error| Problem::new(Code::InvalidMultipart).detail(error.body_text()))?;
+            create_with_upload(&state, multipart).await?
+        }
+        "application/json" => {
+            let Json(body): Json<NewJobBody> = Json::from_request(request, &state).await?;
+            let options = serde_json::Value::Object(body.options.unwrap_or_default());
+            let new = NewJob { id: Uuid::now_v7(), name: body.name, dataset: body.dataset_id, options, ignored: None };
+            state.jobs.enqueue(new).await?
+        }
+        _ => {
+            let message = "the body must be multipart/form-data or application/json";
+            return Err(Problem::new(Code::UnsupportedMediaType).detail(message));
+        }
+    };
+    let location = wire::job_link(&row.id);
+    let mut response = (StatusCode::ACCEPTED, axum::Json(view(&state, row).await?)).into_response();
+    if let Ok(location) = HeaderValue::from_str(&location) {
+        response.headers_mut().insert(header::LOCATION, location);
+    }
+    Ok(response)
+}
+
+/// The dataset of an upload: goes again unless the upload becomes a job, also when the sender leaves in the middle.
+struct OwnDataset {
+    jobs: Jobs,
+    dataset: Uuid,
+    kept: bool,
+}
+
+impl Drop for OwnDataset {
+    fn drop(&mut self) {
+        if !self.kept {
+            let (jobs, dataset) = (self.jobs.clone(), self.dataset);
+            tokio::spawn(async move {
+                if let Err(error) = jobs.delete_dataset(dataset).await {
+                    tracing::warn!(%dataset, %error, "what a broken upload left behind stays until the next start");
+                }
+            });
+        }
+    }
+}
+
+async fn create_with_upload(state: &AppState, multipart: Multipart) -> Result<JobRow, Problem> {
+    let (id, dataset) = (Uuid::now_v7(), Uuid::now_v7());
+    let mut tx = state.jobs.store.db.write().await?;
+    datasets::insert(&mut tx, dataset, "", now_ms(), Some(id)).await?;
+    tx.commit().await?;
+    let mut own = OwnDataset { jobs: state.jobs.clone(), dataset, kept: false };
+    let received = receive(state, multipart, dataset, true).await?;
+    let options = options_of(&received)?;
+    let name = received.name.unwrap_or_default();
+    let row = state.jobs.enqueue(NewJob { id, name, dataset, options, ignored: Some(received.ignored) }).await?;
+    own.kept = true;
+    Ok(row)
+}
+
+fn options_of(received: &Received) -> Result<serde_json::Value, Problem> {
+    let text = received.options.as_deref().map(str::trim).filter(|text| !text.is_empty()).unwrap_or("{}");
+    let options: serde_json::Value = serde_json::from_str(text)
+        .map_err(|error| Problem::new(Code::InvalidJson).detail(format!("options: {error}")))?;
+    if !options.is_object() {
+        return Err(Problem::new(Code::InvalidOptions).detail("the options must be a JSON object"));
+    }
+    Ok(options)
+}

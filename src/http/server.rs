@@ -1,0 +1,93 @@
+//! The running service: store, recovery, executor and listener, started and stopped together.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+use super::{AppState, router};
+use crate::config::ServerConfig;
+use crate::jobs::{Engine, Executor, Hub, Jobs, recover};
+use crate::store::{Store, StoreError};
+
+/// Why the service could not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// The data directory can't be used.
+    #[error("the data directory {path}: {source}")]
+    Store {
+        /// Which.
+        path: String,
+        /// Why.
+        source: StoreError,
+    },
+    /// The address can't be listened on.
+    #[error("can't listen on {address}: {source}")]
+    Bind {
+        /// Which.
+        address: SocketAddr,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+/// A service that runs.
+pub struct Server {
+    /// Where it listens.
+    pub address: SocketAddr,
+    shutdown: CancellationToken,
+    listener: JoinHandle<io::Result<()>>,
+    executor: JoinHandle<()>,
+    grace: Duration,
+    store: Arc<Store>,
+}
+
+impl Server {
+    /// Opens the data directory, puts it in order, starts the executor and listens.
+    ///
+    /// # Errors
+    /// Why it could not start.
+    pub async fn start(config: ServerConfig, engine: Arc<dyn Engine>) -> Result<Self, ServerError> {
+        let failed = |source| ServerError::Store { path: config.data_dir.display().to_string(), source };
+        let store = Arc::new(Store::open(&config.data_dir).await.map_err(failed)?);
+        let recovered = recover(&store).await.map_err(failed)?;
+        tracing::info!(?recovered, data_dir = %store.data.root().display(), "store opened");
+        let bind_failed = |source| ServerError::Bind { address: config.bind, source };
+        let listener = TcpListener::bind(config.bind).await.map_err(bind_failed)?;
+        let address = listener.local_addr().map_err(bind_failed)?;
+        let jobs = Jobs { store: Arc::clone(&store), hub: Arc::new(Hub::default()), engine };
+        let shutdown = CancellationToken::new();
+        let executor = Executor { jobs: jobs.clone(), threads: config.threads, seed: config.seed };
+        let executor = tokio::spawn(executor.run(config.parallel_jobs, shutdown.clone()));
+        let grace = config.shutdown_grace;
+        let app = router(AppState::new(jobs, config, shutdown.clone()));
+        let stop = shutdown.clone().cancelled_owned();
+        let listener = tokio::spawn(async move { axum::serve(listener, app).with_graceful_shutdown(stop).await });
+        Ok(Self { address, shutdown, listener, executor, grace, store })
+    }
+
+    /// Stops: no new requests; open ones and the running job get the time of grace, and the job goes back to the queue.
+    pub async fn stop(mut self) {
+        self.shutdown.cancel();
+        let ended = tokio::time::timeout(self.grace, async {
+            let (listener, executor) = tokio::join!(&mut self.listener, &mut self.executor);
+            if let Err(error) = listener.map_err(io::Error::other).and_then(|result| result) {
+                tracing::error!(%error, "the listener ended with an error");
+            }
+            if let Err(error) = executor {
+                tracing::error!(%error, "the executor ended with an error");
+            }
+        })
+        .await;
+        if ended.is_err() {
+            tracing::warn!("requests or a job did not end in time; the job goes on after the next start");
+            self.listener.abort();
+            self.executor.abort();
+        }
+        self.store.db.close().await;
+    }
+}

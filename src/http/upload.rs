@@ -1,0 +1,331 @@
+//! Photographs out of a multipart request, straight to disk.
+//!
+//! Memory is fixed: the bytes of a part go through a short queue to a blocking writer, which hashes and stores them; files are
+//! synced side by side and committed in batches. A sender that stalls is given up, one that disconnects leaves nothing but
+//! photographs that sending again finds stored.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::Multipart;
+use axum::extract::multipart::{Field, MultipartError};
+use axum::http::{HeaderMap, StatusCode, header};
+use bytes::Bytes;
+use tokio::sync::mpsc;
+use tokio::task::{JoinHandle, spawn_blocking};
+use uuid::Uuid;
+
+use super::AppState;
+use super::problem::{Code, Problem};
+use crate::config::UploadLimits;
+use crate::store::{ArchiveError, Committed, ImagePath, InvalidFileName, StagedFile, StagedWriter, Store, unpack};
+
+/// Files synced side by side and committed at once.
+const BATCH_FILES: usize = 32;
+/// Chunks on their way to the writer; a chunk is what one read of the connection brought.
+const QUEUED_CHUNKS: usize = 8;
+/// Names of left-out files that are told; all are counted.
+const TOLD_NAMES: usize = 100;
+/// Bytes of the text parts.
+const MAX_TEXT_BYTES: usize = 256 << 10;
+
+/// What a request brought.
+#[derive(Debug, Default)]
+pub(super) struct Received {
+    pub(super) stored: usize,
+    pub(super) unchanged: usize,
+    /// Files left out, and the first of their names.
+    pub(super) ignored: usize,
+    pub(super) ignored_names: Vec<String>,
+    /// The `name` part.
+    pub(super) name: Option<String>,
+    /// The `options` part.
+    pub(super) options: Option<String>,
+}
+
+impl Received {
+    fn ignore(&mut self, name: String) {
+        self.ignored += 1;
+        if self.ignored_names.len() < TOLD_NAMES {
+            self.ignored_names.push(name);
+        }
+    }
+}
+
+/// One request on its way into a dataset.
+struct Intake {
+    store: Arc<Store>,
+    dataset: Uuid,
+    limits: UploadLimits,
+    idle: Duration,
+    /// For files on their way; goes with all it holds when the request ends.
+    scratch: tempfile::TempDir,
+    received: Received,
+    bytes: u64,
+    files: usize,
+    batch: Vec<JoinHandle<std::io::Result<StagedFile>>>,
+}
+
+/// Stores every photograph of a request in a dataset; the text parts are taken where `with_text` says so.
+pub(super) async fn receive(
+    state: &AppState,
+    mut multipart: Multipart,
+    dataset: Uuid,
+    with_text: bool,
+) -> Result<Received, Problem> {
+    let incoming = state.jobs.store.data.incoming();
+    let mut intake = Intake {
+        store: Arc::clone(&state.jobs.store),
+        dataset,
+        limits: state.config.uploads,
+        idle: state.config.upload_idle_timeout,
+        scratch: tempfile::tempdir_in(incoming)?,
+        received: Received::default(),
+        bytes: 0,
+        files: 0,
+        batch: Vec::new(),
+    };
+    loop {
+        let Some(field) = in_time(intake.idle, multipart.next_field()).await? else { break };
+        match field.name().unwrap_or("") {
+            "images" => intake.photograph(field).await?,
+            "archive" => intake.archive(field).await?,
+            "name" if with_text => intake.received.name = Some(intake.text(field).await?),
+            "options" if with_text => intake.received.options = Some(intake.text(field).await?),
+            other => {
+                let message = format!("no part {other:?} is known here");
+                return Err(Problem::new(Code::InvalidMultipart).detail(message));
+            }
+        }
+    }
+    intake.commit().await?;
+    state.metrics.uploaded(intake.bytes, intake.received.stored);
+    Ok(intake.received)
+}
+
+impl Intake {
+    async fn photograph(&mut self, mut field: Field<'_>) -> Result<(), Problem> {
+        let name = file_name(field.headers())?;
+        let path = ImagePath::parse(&name).map_err(|why| Problem::file_name(&name, why))?;
+        if !path.is_photograph() {
+            while self.chunk(&mut field).await?.is_some() {}
+            self.received.ignore(name);
+            return Ok(());
+        }
+        self.count_file()?;
+        let limit = self.limits.max_file_bytes;
+        let writer = self.spool(field, limit).await.map_err(|problem| problem.path(&path))?;
+        self.batch.push(spawn_blocking(move || writer.finish(path)));
+        if self.batch.len() >= BATCH_FILES {
+            self.commit().await?;
+        }
+        Ok(())
+    }
+
+    async fn archive(&mut self, field: Field<'_>) -> Result<(), Problem> {
+        let limit = self.limits.max_upload_bytes;
+        let writer = self.spool(field, limit).await?;
+        let archive = ImagePath::parse("archive.zip").map_err(|why| Problem::internal(&why))?;
+        let archive =
+            spawn_blocking(move || writer.finish(archive)).await.map_err(|panic| Problem::internal(&panic))??;
+        let (sender, mut unpacked) = mpsc::channel::<StagedFile>(QUEUED_CHUNKS);
+        let (limits, scratch) = (self.limits.archive, self.scratch.path().to_path_buf());
+        let unpacking = spawn_blocking(move || {
+            unpack(archive.staged_at(), &limits, &scratch, &mut |file| {
+                // Nobody takes it any more: the request was refused or broke off.
+                sender.blocking_send(file).map_err(|_| ArchiveError::Invalid("the request ended".to_owned()))
+            })
+        });
+        while let Some(file) = unpacked.recv().await {
+            self.count_file()?;
+            self.batch.push(spawn_blocking(move || Ok(file)));
+            if self.batch.len() >= BATCH_FILES {
+                self.commit().await?;
+            }
+        }
+        for name in unpacking.await.map_err(|panic| Problem::internal(&panic))?? {
+            self.received.ignore(name);
+        }
+        Ok(())
+    }
+
+    /// Writes a part into a temporary file, of at most `limit` bytes.
+    async fn spool(&mut self, mut field: Field<'_>, limit: u64) -> Result<StagedWriter, Problem> {
+        let (sender, mut chunks) = mpsc::channel::<Bytes>(QUEUED_CHUNKS);
+        let scratch = self.scratch.path().to_path_buf();
+        let writing = spawn_blocking(move || {
+            let mut writer = StagedWriter::create(&scratch)?;
+            while let Some(chunk) = chunks.blocking_recv() {
+                writer.write(&chunk)?;
+            }
+            Ok::<_, std::io::Error>(writer)
+        });
+        let mut size_bytes = 0;
+        while let Some(chunk) = self.chunk(&mut field).await? {
+            size_bytes += chunk.len() as u64;
+            if size_bytes > limit {
+                let message = format!("a file has at most {limit} bytes");
+                return Err(Problem::new(Code::PayloadTooLarge).detail(message));
+            }
+            if sender.send(chunk).await.is_err() {
+                // The writer ended early: with an error, which the join below brings.
+                break;
+            }
+        }
+        drop(sender);
+        Ok(writing.await.map_err(|panic| Problem::internal(&panic))??)
+    }
+
+    /// A small part as text.
+    async fn text(&mut self, mut field: Field<'_>) -> Result<String, Problem> {
+        let mut text = Vec::new();
+        while let Some(chunk) = self.chunk(&mut field).await? {
+            text.extend_from_slice(&chunk);
+            if text.len() > MAX_TEXT_BYTES {
+                return Err(Problem::new(Code::PayloadTooLarge).detail("a text part is too long"));
+            }
+        }
+        String::from_utf8(text).map_err(|_| Problem::new(Code::InvalidMultipart).detail("a text part is not UTF-8"))
+    }
+
+    /// The next bytes of a part, counted.
+    async fn chunk(&mut self, field: &mut Field<'_>) -> Result<Option<Bytes>, Problem> {
+        let chunk = in_time(self.idle, field.chunk()).await?;
+        self.bytes += chunk.as_ref().map_or(0, Bytes::len) as u64;
+        if self.bytes > self.limits.max_upload_bytes {
+            let message = format!("a request brings at most {} bytes", self.limits.max_upload_bytes);
+            return Err(Problem::new(Code::PayloadTooLarge).detail(message));
+        }
+        Ok(chunk)
+    }
+
+    fn count_file(&mut self) -> Result<(), Problem> {
+        self.files += 1;
+        if self.files > self.limits.max_files {
+            let message = format!("a request brings at most {} photographs", self.limits.max_files);
+            return Err(Problem::new(Code::TooManyFiles).detail(message));
+        }
+        Ok(())
+    }
+
+    /// Puts the batch into the dataset.
+    async fn commit(&mut self) -> Result<(), Problem> {
+        let mut files = Vec::with_capacity(self.batch.len());
+        for file in self.batch.drain(..) {
+            files.push(file.await.map_err(|panic| Problem::internal(&panic))??);
+        }
+        if files.is_empty() {
+            return Ok(());
+        }
+        // In a task of its own, so that a sender who leaves can't leave it half done.
+        let (store, dataset) = (Arc::clone(&self.store), self.dataset);
+        let commit = tokio::spawn(async move { store.commit_images(dataset, files).await });
+        let Committed { stored, unchanged } = commit.await.map_err(|panic| Problem::internal(&panic))??;
+        self.received.stored += stored;
+        self.received.unchanged += unchanged;
+        Ok(())
+    }
+}
+
+/// Waits for bytes of the sender, but not for ever.
+async fn in_time<T>(idle: Duration, read: impl Future<Output = Result<T, MultipartError>>) -> Result<T, Problem> {
+    match tokio::time::timeout(idle, read).await {
+        Ok(Ok(value)) => Ok(value),
+        Ok(Err(error)) if error.status() == StatusCode::PAYLOAD_TOO_LARGE => {
+            Err(Problem::new(Code::PayloadTooLarge).detail(error.body_text()))
+        }
+        Ok(Err(error)) => Err(Problem::new(Code::InvalidMultipart).detail(error.body_text())),
+        Err(_) => Err(Problem::new(Code::RequestTimeout).detail("no byte came for too long")),
+    }
+}
+
+/// The file name of a part, with its folders: `filename*` (RFC 8187) when there is one, else `filename`, where a backslash stands
+/// before a quote or another backslash only.
+fn file_name(headers: &HeaderMap) -> Result<String, Problem> {
+    let missing = || Problem::new(Code::InvalidMultipart).detail("a part `images` has no file name");
+    let value = headers.get(header::CONTENT_DISPOSITION).ok_or_else(missing)?;
+    let text = std::str::from_utf8(value.as_bytes())
+        .map_err(|_| Problem::file_name(&String::from_utf8_lossy(value.as_bytes()), InvalidFileName::Encoding))?;
+    let mut plain = None;
+    for (key, value) in parameters(text) {
+        match key.as_str() {
+            "filename*" => {
+                let encoded = value.splitn(3, '\'').nth(2).ok_or_else(missing)?.to_owned();
+                return percent_encoding::percent_decode_str(&encoded)
+                    .decode_utf8()
+                    .map(std::borrow::Cow::into_owned)
+                    .map_err(|_| Problem::file_name(&encoded, InvalidFileName::Encoding));
+            }
+            "filename" => plain = Some(value),
+            _ => {}
+        }
+    }
+    plain.ok_or_else(missing)
+}
+
+/// The parameters of a header value such as `form-data; name="a"; filename="b;c"`, keys in lower case.
+fn parameters(value: &str) -> Vec<(String, String)> {
+    let mut found = Vec::new();
+    let mut rest = value.find(';').map_or("", |at| &value[at + 1..]);
+    while let Some((key, after)) = rest.split_once('=') {
+        let key = key.trim_start_matches([';', ' ', '\t']).trim_end().to_ascii_lowercase();
+        let after = after.trim_start();
+        let (text, end) = match after.strip_prefix('"') {
+            Some(quoted) => {
+                let (text, end) = unquote(quoted);
+                (text, end + 1)
+            }
+            None => {
+                let end = after.find(';').unwrap_or(after.len());
+                (after[..end].trim_end().to_owned(), end)
+            }
+        };
+        found.push((key, text));
+        rest = &after[end..];
+    }
+    found
+}
+
+/// The text up to the closing quote, and where that ends.
+fn unquote(quoted: &str) -> (String, usize) {
+    let mut text = String::new();
+    let mut letters = quoted.char_indices().peekable();
+    while let Some((at, letter)) = letters.next() {
+        match letter {
+            '"' => return (text, at + 1),
+            '\\' if matches!(letters.peek(), Some((_, '"' | '\\'))) => text.extend(letters.next().map(|(_, c)| c)),
+            other => text.push(other),
+        }
+    }
+    (text, quoted.len())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn name_of(disposition: &str) -> Option<String> {
+        let mut headers = HeaderMap::new();
+        let value = header::HeaderValue::from_bytes(disposition.as_bytes()).unwrap();
+        headers.insert(header::CONTENT_DISPOSITION, value);
+        file_name(&headers).ok()
+    }
+
+    #[test]
+    fn file_names_come_as_every_client_writes_them() {
+        for (disposition, name) in [
+            (r#"form-data; name="images"; filename="a/b c.jpg""#, "a/b c.jpg"),
+            (r#"form-data; name=images; filename=a.jpg"#, "a.jpg"),
+            (r#"form-data; filename="x;y=\"z\".jpg"; name="images""#, r#"x;y="z".jpg"#),
+            (r#"form-data; name="images"; filename="石段.jpg""#, "石段.jpg"),
+            (r#"form-data; name="images"; filename="x.jpg"; filename*=utf-8''%E7%9F%B3%20a.jpg"#, "石 a.jpg"),
+            (r#"form-data; name="filename=evil"; filename="real.jpg""#, "real.jpg"),
+            (r#"form-data; name="images"; FileName="a\b.jpg""#, r"a\b.jpg"),
+        ] {
+            assert_eq!(name_of(disposition).as_deref(), Some(name), "{disposition}");
+        }
+        assert_eq!(name_of(r#"form-data; name="images""#), None);
+        assert_eq!(name_of(r#"form-data; filename*=broken"#), None);
+    }
+}
