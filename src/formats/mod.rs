@@ -7,5 +7,6 @@ pub mod exif;
 pub mod photograph;
 pub mod ply;
 pub mod report;
+pub mod report_html;
 
 pub use error::FormatError;

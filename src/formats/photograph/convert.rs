@@ -75,7 +75,7 @@ pub(super) fn shrink_gray(image: GrayImage, max_long_side: Option<u32>) -> Decod
 }
 
 /// Reduces the longer side to `max_long_side`, where it is longer.
-pub(super) fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbImage> {
+pub fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbImage> {
     let RgbImage { width, height, data } = image;
     let (data, (new_width, new_height)) = shrink(data, (width, height), PixelType::U8x3, max_long_side);
     Decoded {

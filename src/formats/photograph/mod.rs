@@ -17,6 +17,8 @@ use serde::{Deserialize, Serialize};
 use super::exif::Exif;
 use crate::scene::{GrayImage, RgbImage};
 
+pub use convert::shrink_rgb;
+
 /// A file format, recognised by content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -203,7 +205,7 @@ impl<'a> Photograph<'a> {
     }
 }
 
-/// A photograph as a small JPEG (for pages), its longer side at most `max_long_side`.
+/// A raster as a JPEG; `quality` is 1 to 100.
 ///
 /// # Errors
 /// When the pixels can't be encoded.
