@@ -2,8 +2,10 @@
 
 import { getJob, isOver } from "./api.js";
 
-/** Without an event for so long, the job is asked for. */
+/** Without an event for so long, the job is asked for ... */
 const QUIET_MS = 6000;
+/** ... and this often where no stream comes through. */
+const POLL_MS = 2000;
 /** Several events at once are answered by one request. */
 const SETTLE_MS = 120;
 
@@ -55,8 +57,8 @@ export function follow(job, onchange, ontrouble) {
     onchange(job);
   });
   const timer = setInterval(() => {
-    if (performance.now() - heard > QUIET_MS) ask();
-  }, 2000);
+    if (source.readyState === EventSource.CLOSED || performance.now() - heard > QUIET_MS) ask();
+  }, POLL_MS);
 
   function close() {
     closed = true;

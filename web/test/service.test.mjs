@@ -1,0 +1,114 @@
+// The page on the real service: photographs in by the page, model on the canvas, files out.
+import assert from "node:assert/strict";
+import { spawn } from "node:child_process";
+import { existsSync } from "node:fs";
+import { mkdtemp, readFile, readdir, rm } from "node:fs/promises";
+import { createServer } from "node:net";
+import { tmpdir } from "node:os";
+import { join } from "node:path";
+import { after, before, test } from "node:test";
+import { fileURLToPath } from "node:url";
+import { distinctColours, noBrowser, openBrowser, openPage } from "./browser.mjs";
+
+const PHOTOGRAPHS = fileURLToPath(new URL("../../../shared/datasets/bundler-et/images/", import.meta.url));
+const BINARY = process.env.MULTISTAGE_BIN ?? fileURLToPath(new URL("../../target/debug/multistage", import.meta.url));
+/** The photographs are small and few; a busy machine is slow. */
+const MODEL_TIMEOUT_MS = 240_000;
+
+const skip = noBrowser || (existsSync(PHOTOGRAPHS) ? false : `the photographs of ${PHOTOGRAPHS} are absent`);
+
+let browser;
+let service;
+let data;
+let url;
+let log = "";
+
+const freePort = () => new Promise((resolve, reject) => {
+  const probe = createServer();
+  probe.on("error", reject);
+  probe.listen(0, "127.0.0.1", () => {
+    const { port } = probe.address();
+    probe.close(() => resolve(port));
+  });
+});
+
+before(async () => {
+  if (skip) return;
+  data = await mkdtemp(join(tmpdir(), "multistage-service-"));
+  const port = await freePort();
+  url = `http://127.0.0.1:${port}/`;
+  service = spawn(BINARY, ["serve", "--bind", `127.0.0.1:${port}`, "--data-dir", data], { stdio: ["ignore", "pipe", "pipe"] });
+  for (const stream of [service.stdout, service.stderr]) stream.on("data", (text) => { log += text; });
+  let ended = false;
+  service.on("exit", () => { ended = true; });
+  service.on("error", (error) => { ended = true; log += error; });
+  for (const deadline = Date.now() + 30_000; ; ) {
+    if (await fetch(`${url}readyz`).then((answer) => answer.ok, () => false)) break;
+    assert.ok(!ended && Date.now() < deadline, `the service did not come up: ${log}`);
+    await new Promise((resolve) => setTimeout(resolve, 100));
+  }
+  browser = await openBrowser();
+});
+after(async () => {
+  await browser?.close();
+  if (service && service.exitCode === null) {
+    const gone = new Promise((resolve) => service.on("exit", resolve));
+    service.kill("SIGTERM");
+    await gone;
+  }
+  if (data) await rm(data, { recursive: true, force: true });
+});
+
+test("photographs become a model on the page, and its points can be downloaded", { skip, timeout: MODEL_TIMEOUT_MS + 60_000 }, async () => {
+  const { page, errors } = await openPage(browser, url);
+  await page.setInputFiles("#pick-folder", PHOTOGRAPHS);
+  const pictures = (await readdir(PHOTOGRAPHS)).filter((name) => name.endsWith(".jpg")).length;
+  await page.getByRole("heading", { name: `${pictures} pictures` }).waitFor();
+  await page.fill("#job-name", "E. T.");
+  await page.getByRole("button", { name: "Upload and reconstruct" }).click();
+
+  await page.locator(".stages li").first().waitFor({ timeout: 30_000 });
+  await page.locator(".overall progress").waitFor();
+  await page.locator(".job-head .badge.succeeded, .job-head .badge.failed").waitFor({ timeout: MODEL_TIMEOUT_MS });
+  assert.equal(await page.locator(".job-head .badge").textContent(), "finished", await page.locator("main").innerText());
+  assert.equal(await page.locator(".stages li.done").count(), await page.locator(".stages li").count());
+
+  await page.locator('.viewer[data-state="shown"]').waitFor({ timeout: 30_000 });
+  const points = Number((await page.locator(".facts div").nth(1).locator("dd").textContent()).replaceAll(",", ""));
+  assert.ok(points > 500, `only ${points} points`);
+  await page.waitForTimeout(500);
+  const canvas = page.locator("canvas");
+  const withCameras = await distinctColours(page, canvas);
+  assert.ok(withCameras > 300, `the canvas shows only ${withCameras} colours`);
+  const before = (await canvas.screenshot()).toString("base64");
+  await page.uncheck("#show-cameras");
+  await page.waitForTimeout(300);
+  assert.notEqual((await canvas.screenshot()).toString("base64"), before, "cameras are drawn");
+  if (process.env.MULTISTAGE_SCREENSHOTS) {
+    await page.check("#show-cameras");
+    await page.screenshot({ path: join(process.env.MULTISTAGE_SCREENSHOTS, "service.png"), fullPage: true });
+  }
+
+  await page.getByRole("button", { name: /^all / }).click();
+  await page.locator(".verdicts li").nth(pictures - 1).waitFor();
+  await page.waitForFunction(() => [...document.querySelectorAll(".verdicts img")].slice(0, 3).every((image) => image.complete && image.naturalWidth > 1));
+
+  const [download] = await Promise.all([page.waitForEvent("download"), page.getByRole("link", { name: "ply/0/points.ply" }).click()]);
+  assert.equal(download.suggestedFilename(), "points.ply");
+  const file = await readFile(await download.path());
+  assert.match(file.subarray(0, 400).toString("latin1"), new RegExp(`^ply\\nformat binary_little_endian 1.0\\n[^]*element vertex ${points}\\n`));
+  assert.deepEqual(errors, []);
+  await page.close();
+});
+
+test("a job of pictures that show nothing fails with a sentence and verdicts", { skip, timeout: 120_000 }, async () => {
+  const { page, errors } = await openPage(browser, url);
+  // Three broken pictures: the service must say so, not the browser.
+  await page.setInputFiles("#pick-files", ["a", "b", "c"].map((name) => ({ name: `${name}.jpg`, mimeType: "image/jpeg", buffer: Buffer.from(`no picture ${name}`) })));
+  await page.getByRole("button", { name: "Upload and reconstruct" }).click();
+  await page.locator(".job-head .badge.failed").waitFor({ timeout: 60_000 });
+  await page.getByText("No model came of these pictures").waitFor();
+  await page.locator(".verdicts .badge.rejected").nth(2).waitFor();
+  assert.deepEqual(errors, []);
+  await page.close();
+});
