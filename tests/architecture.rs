@@ -23,8 +23,8 @@ const LAYERS: &[&str] = &[
     "ransac",
     "solvers",
     "scene",
-    "camera",
     "geometry",
+    "camera",
     "math",
 ];
 

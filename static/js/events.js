@@ -52,7 +52,11 @@ export function follow(job, onchange, ontrouble) {
   listen("state", refresh);
   listen("stage", refresh);
   listen("progress", ({ stage, eta_s }) => {
-    const stages = job.stages.map((s) => (s.name === stage.name && s.iteration === stage.iteration && s.state !== "done" ? { ...s, state: "running", done: stage.done, total: stage.total } : s));
+    // One stage runs at a time: another one that ran before has ended, though the news of it is still on the way.
+    const stages = job.stages.map((s) => {
+      if (s.name === stage.name && s.iteration === stage.iteration) return { ...s, state: "running", done: stage.done, total: stage.total };
+      return s.state === "running" ? { ...s, state: "done" } : s;
+    });
     job = { ...job, stage, eta_s, stages };
     onchange(job);
   });

@@ -164,7 +164,7 @@ export async function startMock({ stage_ms = 300, fail = () => undefined, models
         const n = Number(rest.split("/")[2]);
         return send("image/svg+xml", Buffer.from(`<svg xmlns="http://www.w3.org/2000/svg" width="320" height="240"><rect width="320" height="240" fill="hsl(${(n * 47) % 360} 25% 65%)"/><path d="M0 200 90 110l60 50 80-90 90 130v40H0z" fill="hsl(${(n * 47) % 360} 20% 42%)"/></svg>`));
       }
-      const outputs = { "ply/0/cameras.ply": camerasPly, "ply/0/points.ply": pointsPly, "ply/1/cameras.ply": camerasPly, "ply/1/points.ply": pointsPly, "report.html": () => Buffer.from("<!doctype html><title>Report</title>"), "report.json": () => Buffer.from("{}"), "sparse/0/images.bin": () => Buffer.alloc(5000) };
+      const outputs = { "ply/0/cameras.ply": () => camerasPly(Math.max(0, files.size - 2)), "ply/0/points.ply": pointsPly, "ply/1/cameras.ply": () => camerasPly(Math.max(0, files.size - 2)), "ply/1/points.ply": pointsPly, "report.html": () => Buffer.from("<!doctype html><title>Report</title>"), "report.json": () => Buffer.from("{}"), "sparse/0/images.bin": () => Buffer.alloc(5000) };
       if (rest === "/outputs") {
         const list = Object.entries(outputs).filter(([file]) => models > 1 || !file.startsWith("ply/1")).map(([file, make]) => ({ path: file, size_bytes: make().length, media_type: "application/octet-stream", etag: '"0"', links: { self: `/api/v1/jobs/${job.id}/outputs/${file}` } }));
         return json(200, { files: over ? list : [], total_bytes: list.reduce((sum, f) => sum + f.size_bytes, 0), links: { archive: `/api/v1/jobs/${job.id}/outputs.zip` } });
@@ -211,9 +211,8 @@ function pointsPly() {
   return Buffer.concat([PLY_HEAD(`element vertex ${n}\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n`), rows]);
 }
 
-/** Frusta in a ring round it. */
-function camerasPly() {
-  const n = 24;
+/** n frusta in a ring round it. */
+function camerasPly(n) {
   const vertices = Buffer.alloc(12 * 5 * n);
   const edges = Buffer.alloc(8 * 8 * n);
   for (let c = 0; c < n; c += 1) {

@@ -73,6 +73,16 @@ test("a folder goes up with its sub-folders and becomes a model on the canvas", 
   await page.waitForTimeout(400);
   const turned = await look();
   assert.notEqual(turned, first, "an arrow key turns the model");
+  // Clicking about where the ring of cameras stands finds one, and names its picture.
+  const box = await canvas.boundingBox();
+  const label = page.locator(".viewer .label");
+  search: for (const y of [0.55, 0.65, 0.45, 0.75]) {
+    for (let x = 0.1 * box.width; x < 0.9 * box.width; x += 15) {
+      await page.mouse.click(box.x + x, box.y + y * box.height);
+      if (await label.isVisible()) break search;
+    }
+  }
+  await label.getByText(/temple\/.*\.jpg/).waitFor();
   await page.keyboard.press("c");
   await page.waitForTimeout(400);
   assert.equal(await page.isChecked("#show-cameras"), false);

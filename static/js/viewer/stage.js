@@ -53,6 +53,7 @@ export class Stage {
     this.material = new three.ShaderMaterial({ vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: { size: { value: 2 }, reference: { value: 1 } } });
     this.points = null;
     this.frusta = null;
+    this.chosen = null;
     this.pointSize = 2;
     this.pending = null;
     this.controls.addEventListener("change", () => this.draw());
@@ -93,7 +94,38 @@ export class Stage {
 
   showCameras(visible) {
     if (this.frusta) this.frusta.visible = visible;
+    if (this.chosen) this.chosen.visible = visible;
     this.draw();
+  }
+
+  /** Draws the frustum of the `count` vertices from `first` in another colour; null: none. */
+  highlight(first, count) {
+    this.dropChosen();
+    if (first !== null) {
+      const { three } = this;
+      const inside = (vertex) => vertex >= first && vertex < first + count;
+      const pairs = [];
+      for (let k = 0; k < this.cameras.lines.length; k += 2) {
+        if (inside(this.cameras.lines[k])) pairs.push(this.cameras.lines[k], this.cameras.lines[k + 1]);
+      }
+      const lines = new three.BufferGeometry();
+      lines.setAttribute("position", this.frusta.geometry.getAttribute("position"));
+      lines.setIndex(new three.BufferAttribute(Uint32Array.from(pairs), 1));
+      // Over everything else, so that it is seen through the points.
+      this.chosen = new three.LineSegments(lines, new three.LineBasicMaterial({ color: 0x7fe3ff, depthTest: false, transparent: true }));
+      this.chosen.frustumCulled = false;
+      this.chosen.renderOrder = 1;
+      this.model.add(this.chosen);
+    }
+    this.draw();
+  }
+
+  dropChosen() {
+    if (!this.chosen) return;
+    this.model.remove(this.chosen);
+    this.chosen.geometry.dispose();
+    this.chosen.material.dispose();
+    this.chosen = null;
   }
 
   /** Which axis of the model points up: "z", "-y", ... */
@@ -198,6 +230,7 @@ export class Stage {
   }
 
   clear() {
+    this.dropChosen();
     for (const object of [this.points, this.frusta]) {
       if (!object) continue;
       this.model.remove(object);
