@@ -2,5 +2,6 @@
 
 pub mod descriptor;
 mod mutual;
+pub mod two_view;
 
 pub use mutual::{MatchOptions, RatioTest, match_mutual, match_mutual_packed, mutual_matches};

@@ -171,9 +171,9 @@ fn constraints(e: &[[Linear; 3]; 3]) -> [Cubic; 10] {
     let mut rows = [[0.0; 20]; 10];
     for i in 0..3 {
         for j in 0..3 {
-            for k in 0..3 {
+            for (k, row) in e.iter().enumerate() {
                 let quadratic = if i <= k { &s[i][k] } else { &s[k][i] };
-                add_cubic_product(&mut rows[3 * i + j], quadratic, &e[k][j]);
+                add_cubic_product(&mut rows[3 * i + j], quadratic, &row[j]);
             }
         }
     }
