@@ -19,7 +19,7 @@ setup: page web/node_modules/.package-lock.json
 page: static/vendor/three.js
 
 web/node_modules/.package-lock.json: web/package-lock.json
-	cd web && npm ci --no-audit --no-fund
+	cd web && npm ci --ignore-scripts --no-audit --no-fund
 
 static/vendor/three.js: web/node_modules/.package-lock.json web/three-entry.mjs web/vendor.mjs
 	cd web && npm run --silent vendor

@@ -57,5 +57,6 @@ export const cancelJob = (job) => request("POST", job.links.cancel);
 export const resumeJob = (job) => request("POST", job.links.resume);
 export const jobImages = (job, cursor, state, limit = 60) => request("GET", `${job.links.images}?${page(cursor, limit, state ? { state } : {})}`);
 export const jobOutputs = (job) => request("GET", job.links.outputs);
+export const jobReport = (job) => request("GET", `${job.links.outputs}/report.json`);
 export const createDataset = (name) => request("POST", `${API}/datasets`, { name });
 export const deleteDataset = (dataset) => request("DELETE", dataset.links.self);

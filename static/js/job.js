@@ -1,6 +1,6 @@
 // The view of one job: its stages while it runs, then the model, the verdicts and the downloads.
 
-import { cancelJob, deleteJob, getJob, isOver, resumeJob } from "./api.js";
+import { cancelJob, deleteJob, getJob, isOver, jobReport, resumeJob } from "./api.js";
 import { announce, confirmed, fill, h } from "./dom.js";
 import { follow } from "./events.js";
 import { STATES, count, fixed, plural, when } from "./format.js";
@@ -95,7 +95,18 @@ export function jobView(main, id) {
       viewer = modelViewer(job);
       results.append(viewer.element, facts());
     }
-    results.append(verdicts(job), downloads(job));
+    results.append(notes(), verdicts(job), downloads(job));
+  }
+
+  /** What the run itself has to say: what was widened, cut or left out, and why. Not there where it says nothing. */
+  function notes() {
+    const list = h("ul", {});
+    const section = h("section", { class: "card", "aria-labelledby": "notes-title", hidden: true }, h("h2", { id: "notes-title" }, "What to know"), list);
+    jobReport(job).then((report) => {
+      fill(list, (report.notes ?? []).map((note) => h("li", {}, note)));
+      section.hidden = list.childElementCount === 0;
+    }, () => {}); // A job that was stopped has no report.
+    return section;
   }
 
   function facts() {

@@ -95,6 +95,7 @@ test("a folder goes up with its sub-folders and becomes a model on the canvas", 
   await page.selectOption("#which-model", "1");
   await page.locator('.viewer[data-state="shown"]').waitFor();
 
+  await page.getByText("The scale is arbitrary").waitFor();
   await page.getByRole("button", { name: "refused 1" }).click();
   await page.getByText("The file is cut short").waitFor();
   assert.equal(await page.locator(".verdicts li").count(), 1);
