@@ -84,6 +84,9 @@ export function jobView(main, id) {
     viewer?.close();
     viewer = null;
     results.replaceChildren();
+    // While it runs the stages are the news, afterwards the model is.
+    if (job.state === "succeeded") results.after(stages.element);
+    else results.before(stages.element);
     if (!isOver(job)) return;
     if (job.error) {
       results.append(h("div", { class: "notice bad" },
