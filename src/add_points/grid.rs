@@ -76,7 +76,8 @@ impl OverlappingGrids {
     /// The cell whose centre is nearest to a position.
     fn center_most_cell(&self, at: &Vector2<f64>) -> usize {
         let cell = (at - self.bounds.min) / self.pitch_px;
-        let (column, row) = (cell.x.round().max(0.0) as usize, cell.y.round().max(0.0) as usize);
+        // Conversion drops the fraction, so adding a half first rounds.
+        let (column, row) = ((cell.x + 0.5).max(0.0) as usize, (cell.y + 0.5).max(0.0) as usize);
         row.min(self.rows - 1) * self.columns + column.min(self.columns - 1)
     }
 

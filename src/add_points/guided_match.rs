@@ -14,8 +14,10 @@
 
 use std::f64::consts::{PI, TAU};
 
+use serde::{Deserialize, Serialize};
+
 use super::candidate_search::SeenMarks;
-use super::epipolar::{EpipolarGeometry, EpipolarLine};
+use super::epipolar::EpipolarGeometry;
 use super::line_groups::group_by_line;
 use super::options::GuidedMatchOptions;
 use super::prepared::PreparedImage;
@@ -23,8 +25,16 @@ use crate::matching::descriptor::{PackedDescriptors, Top2, distance_sq, top2};
 use crate::math::Rng;
 use crate::scene::{Descriptor, ImageId, KeypointIdx};
 
-/// Keypoints that belong together, of the first and of the second image of a pair.
-pub type KeypointMatch = (KeypointIdx, KeypointIdx);
+/// Keypoints of the two images of a pair that belong together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct KeypointMatch {
+    /// The keypoint of the first image.
+    pub first: KeypointIdx,
+    /// The keypoint of the second image.
+    pub second: KeypointIdx,
+    /// Whether it passes the stricter ratio test of matches that nothing else confirms.
+    pub distinctive: bool,
+}
 
 /// Separates this stage's random streams from others'.
 const RANDOM_STREAM: u64 = 0x6164_6470_6f69_6e74;
@@ -35,7 +45,7 @@ const RANDOM_STREAM: u64 = 0x6164_6470_6f69_6e74;
 pub fn guided_match(
     (first_id, first): (ImageId, &PreparedImage),
     (second_id, second): (ImageId, &PreparedImage),
-    settled: &[KeypointMatch],
+    settled: &[(KeypointIdx, KeypointIdx)],
     options: &GuidedMatchOptions,
     seed: u64,
 ) -> Vec<KeypointMatch> {
@@ -76,7 +86,12 @@ pub fn guided_match(
     if matches.len() < options.min_pair_matches {
         return Vec::new();
     }
-    matches.into_iter().map(|found| (KeypointIdx(found.query), KeypointIdx(found.target))).collect()
+    let keypoints = |found: Found| KeypointMatch {
+        first: KeypointIdx(found.query),
+        second: KeypointIdx(found.target),
+        distinctive: found.distinctive,
+    };
+    matches.into_iter().map(keypoints).collect()
 }
 
 /// A query's match.
@@ -85,6 +100,7 @@ struct Found {
     query: u32,
     target: u32,
     distance_sq: u32,
+    distinctive: bool,
 }
 
 /// The search for one image's queries in another.
@@ -126,8 +142,18 @@ impl OneWay<'_> {
             descriptors.extend(group.queries.iter().map(|&q| self.query.features.descriptors[q as usize]));
             top2(&descriptors, &packed, &mut nearest);
             for (&query, nearest) in group.queries.iter().zip(&nearest) {
-                if (nearest.index as usize) < candidates && self.accepts(query, nearest, &rows, band_px) {
-                    found.push(Found { query, target: rows[nearest.index as usize], distance_sq: nearest.distance_sq });
+                if nearest.index as usize >= candidates || !self.is_near(query, rows[nearest.index as usize], band_px) {
+                    continue;
+                }
+                let target = rows[nearest.index as usize];
+                let second = self.second_distance_sq(query, nearest, &rows, &marks);
+                let passes = |max_ratio: f64| {
+                    let allowed = |second: u32| max_ratio * max_ratio * f64::from(second);
+                    second.is_some_and(|second| f64::from(nearest.distance_sq) <= allowed(second))
+                };
+                if !self.check_ratio || passes(self.options.max_ratio) {
+                    let distinctive = passes(self.options.distinctive_ratio);
+                    found.push(Found { query, target, distance_sq: nearest.distance_sq, distinctive });
                 }
             }
         }
@@ -135,37 +161,25 @@ impl OneWay<'_> {
         found
     }
 
-    /// Whether the best candidate passes the ratio test and the exact distance test (equation 3) against the query's own
-    /// line, not only its group's.
-    fn accepts(&self, query: u32, nearest: &Top2, rows: &[u32], band_px: f64) -> bool {
-        let best = rows[nearest.index as usize];
-        let position = &self.target.finder.positions()[best as usize];
-        let near = |line: EpipolarLine| line.distance_px(position) <= band_px;
-        (!self.check_ratio || self.passes_ratio(query, nearest, rows))
-            && self.geometry.line_in_target(&self.query.normalized[query as usize]).is_some_and(near)
+    /// The exact distance test (equation 3) against the query's own line, not only its group's.
+    fn is_near(&self, query: u32, target: u32, band_px: f64) -> bool {
+        let position = &self.target.finder.positions()[target as usize];
+        let line = self.geometry.line_in_target(&self.query.normalized[query as usize]);
+        line.is_some_and(|line| line.distance_px(position) <= band_px)
     }
 
-    fn passes_ratio(&self, query: u32, nearest: &Top2, rows: &[u32]) -> bool {
+    /// The squared distance to the nearest row that is not at the best one's place.
+    fn second_distance_sq(&self, query: u32, nearest: &Top2, rows: &[u32], marks: &SeenMarks) -> Option<u32> {
+        let second = nearest.second_distance_sq?;
         let best = rows[nearest.index as usize];
-        let allows = |second: u32| {
-            let ratio_sq = self.options.max_ratio * self.options.max_ratio;
-            f64::from(nearest.distance_sq) <= ratio_sq * f64::from(second)
-        };
-        let Some(second) = nearest.second_distance_sq else { return false };
-        if allows(second) {
-            return true;
-        }
-        // The rival may be at the best candidate's own place: then the nearest elsewhere counts.
         let here = self.target.same_place.others(best);
-        if here.is_empty() {
-            return false;
-        }
         let descriptor = &self.query.features.descriptors[query as usize];
-        let elsewhere = rows.iter().filter(|&&row| row != best && !here.contains(&row));
-        elsewhere
-            .map(|&row| distance_sq(descriptor, &self.target.features.descriptors[row as usize]))
-            .min()
-            .is_some_and(allows)
+        let distance_to = |row: u32| distance_sq(descriptor, &self.target.features.descriptors[row as usize]);
+        if !here.iter().any(|&row| marks.is_marked(row) && distance_to(row) == second) {
+            return Some(second);
+        }
+        let elsewhere = rows.iter().filter(|&&row| row != best && here.binary_search(&row).is_err());
+        elsewhere.map(|&row| distance_to(row)).min()
     }
 }
 

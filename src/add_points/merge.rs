@@ -118,7 +118,9 @@ impl<'a> Resolver<'a> {
         let mut seen: Vec<Sighting> = stars.iter().flat_map(|star| star.sightings.iter().copied()).collect();
         stars.sort_by(|a, b| {
             let by_length = b.sightings.len().cmp(&a.sightings.len());
-            by_length.then(a.mean_relative_error_sq.total_cmp(&b.mean_relative_error_sq))
+            by_length
+                .then(b.distinctive.cmp(&a.distinctive))
+                .then(a.mean_relative_error_sq.total_cmp(&b.mean_relative_error_sq))
         });
         let mut points = component.points.clone();
         points.sort_by_key(|&id| (std::cmp::Reverse(track_of(model, id).len()), id));
@@ -191,7 +193,7 @@ impl<'a> Resolver<'a> {
         }
         let grant = |xyz: &Vector3<f64>| self.best_per_image(xyz, |claim| claim.owner.is_none());
         let (xyz, track) = refit(self.table, star.xyz, grant)?;
-        if !self.is_good(&xyz, &track) {
+        if !self.is_good(&xyz, &track, star.distinctive) {
             return None;
         }
         self.take(&track);
@@ -219,11 +221,11 @@ impl<'a> Resolver<'a> {
     }
 
     /// Whether a track fixes a new point well enough.
-    fn is_good(&self, xyz: &Vector3<f64>, track: &[Sighting]) -> bool {
+    fn is_good(&self, xyz: &Vector3<f64>, track: &[Sighting], distinctive: bool) -> bool {
         let two_views = track.len() == 2;
         let min_angle_deg = if two_views { self.options.min_angle_two_view_deg } else { self.options.min_angle_deg };
         track.len() >= self.options.min_track_length
-            && (!two_views || track.iter().all(|&seen| self.table.fits_two_view(seen, xyz)))
+            && (!two_views || distinctive && track.iter().all(|&seen| self.table.fits_two_view(seen, xyz)))
             && self.table.has_angle(track, xyz, min_angle_deg.to_radians())
     }
 

@@ -5,7 +5,7 @@
 //!
 //! - [`candidate_pairs`](mod@candidate_pairs) (6.1): images that share points are worth matching;
 //! - [`epipolar`] (6.2, equations 1 to 3): where the counterpart of a feature must lie;
-//! - [`grid`] and [`candidate_search`] (6.2.1, equations 4 to 9): the features near that line, fast;
+//! - [`candidate_search`], by [`grid`] (6.2.1, equations 4 to 9) or [`strips`]: the features near that line, fast;
 //! - [`line_groups`] (6.2.2): features that share a line share the search;
 //! - [`guided_match`](mod@guided_match) (6.2.2, 6.2.3): best descriptor along the line, ratio test after the geometry;
 //! - [`triangulate`] (6.3): each image's matches as tracks, and their points;
@@ -24,6 +24,7 @@ pub mod line_groups;
 pub mod merge;
 mod options;
 pub mod prepared;
+pub mod strips;
 #[cfg(test)]
 mod test_scene;
 #[cfg(test)]
@@ -247,7 +248,7 @@ fn match_prepared(
 }
 
 /// Keypoints of two registered images that see one point.
-fn shared_observations(model: &Reconstruction, first: ImageId, second: ImageId) -> Vec<KeypointMatch> {
+fn shared_observations(model: &Reconstruction, first: ImageId, second: ImageId) -> Vec<(KeypointIdx, KeypointIdx)> {
     let seen = (0u32..).map(KeypointIdx).zip(model.images()[&first].points());
     seen.filter_map(|(keypoint, &point)| {
         let track = &model.point(point?)?.track;

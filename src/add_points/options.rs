@@ -73,8 +73,7 @@ impl CandidatePairOptions {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct GuidedMatchOptions {
-    /// How features near an epipolar line are found; all give the same matches but for what radial search may miss on ties
-    /// of rounding.
+    /// How features near an epipolar line are found; all give the same matches.
     pub search: CandidateSearch,
     /// Half-width of the band around an epipolar line, the paper's d: scaled pixels. Wider bands forgive worse poses and
     /// compare more features. The authors' code has 4.
@@ -89,6 +88,9 @@ pub struct GuidedMatchOptions {
     pub epipole_clearance_bands: f64,
     /// Largest ratio of the best distance to the second best. Raising it gives more and worse matches.
     pub max_ratio: f64,
+    /// Largest ratio of a match that may make a point without a third view's consent: where nothing else speaks against wrong
+    /// matches, this must.
+    pub distinctive_ratio: f64,
     /// Candidate sets smaller than this are filled up with random features of the target, which compete for the second
     /// place only. The authors' 50.
     pub pad_to: usize,
@@ -114,12 +116,13 @@ pub struct GuidedMatchOptions {
 impl Default for GuidedMatchOptions {
     fn default() -> Self {
         Self {
-            search: CandidateSearch::Grid,
+            search: CandidateSearch::Strips,
             band_px: 4.0,
             group_tolerance_px: 2.0,
             cell_half_size_bands: 2.25,
             epipole_clearance_bands: 3.0,
-            max_ratio: 0.75,
+            max_ratio: 0.8,
+            distinctive_ratio: 0.6,
             pad_to: 50,
             same_place_px: 2.0,
             mutual: true,
@@ -143,6 +146,8 @@ impl GuidedMatchOptions {
             errors,
         );
         require(self.max_ratio > 0.0 && self.max_ratio <= 1.0, "guided_match.max_ratio must lie in (0, 1]", errors);
+        let strict = self.distinctive_ratio > 0.0 && self.distinctive_ratio <= self.max_ratio;
+        require(strict, "guided_match.distinctive_ratio must lie in (0, max_ratio]", errors);
         require(self.same_place_px >= 0.0, "guided_match.same_place_px must not be negative", errors);
         let scale = self.max_scale_discrepancy.is_none_or(|factor| factor >= 1.0);
         require(scale, "guided_match.max_scale_discrepancy must be at least 1", errors);

@@ -25,8 +25,8 @@ fn match_images(
 /// Fraction of matches that are right, and fraction of the true pairs that are found.
 fn precision_and_recall(scene: &TestScene, found: &PairMatches) -> (f64, f64) {
     let (a, b) = (found.first.index(), found.second.index());
-    let right = |&&(x, y): &&KeypointMatch| {
-        let (x, y) = (scene.truth[a][x.index()], scene.truth[b][y.index()]);
+    let right = |found: &&KeypointMatch| {
+        let (x, y) = (scene.truth[a][found.first.index()], scene.truth[b][found.second.index()]);
         x.is_some() && x == y
     };
     let right = found.matches.iter().filter(right).count() as f64;
@@ -45,7 +45,7 @@ fn guided_matching_finds_nearly_all_and_little_else() {
         let found = match_images(&scene, &scene.posed, a, b, &AddPointsOptions::default());
         let (precision, recall) = precision_and_recall(&scene, &found);
         assert!(precision > 0.98 && recall > 0.95, "{a}-{b}: precision {precision}, recall {recall}");
-        let targets: BTreeSet<KeypointIdx> = found.matches.iter().map(|found| found.1).collect();
+        let targets: BTreeSet<KeypointIdx> = found.matches.iter().map(|found| found.second).collect();
         assert_eq!(targets.len(), found.matches.len(), "each keypoint once");
     }
 }
@@ -59,6 +59,7 @@ fn all_searches_give_the_same_matches() {
         match_images(&scene, &scene.posed, 0, 3, &options)
     };
     let oracle = with(CandidateSearch::Linear);
+    assert_eq!(with(CandidateSearch::Strips), oracle);
     assert_eq!(with(CandidateSearch::Grid), oracle);
     assert_eq!(with(CandidateSearch::Radial), oracle);
 }
@@ -159,8 +160,8 @@ fn known_correspondences_are_not_matched_again() {
     let found = match_images(&scene, &coarse, 0, 1, &AddPointsOptions::default());
     let (first, second) = (&coarse.images()[&ImageId(0)], &coarse.images()[&ImageId(1)]);
     assert!(shared_observations(&coarse, ImageId(0), ImageId(1)).len() > 100);
-    for (a, b) in &found.matches {
-        let (a, b) = (first.points()[a.index()], second.points()[b.index()]);
+    for found in &found.matches {
+        let (a, b) = (first.points()[found.first.index()], second.points()[found.second.index()]);
         assert!(a.is_none() || a != b);
     }
 }
@@ -273,7 +274,7 @@ fn default_options_are_valid_and_bad_ones_are_named() {
     AddPointsOptions::default().validate(&mut errors);
     assert!(errors.is_empty(), "{errors:?}");
     let mut options = AddPointsOptions::default();
-    options.guided_match.max_ratio = f64::NAN;
+    options.guided_match.band_px = f64::NAN;
     options.triangulation.min_track_length = 1;
     options.validate(&mut errors);
     assert_eq!(errors.len(), 2, "{errors:?}");
@@ -287,6 +288,11 @@ fn triangulation_is_accurate_and_survives_a_wrong_match() {
     let scene = build(&SceneSpec { clutter: 0, pixel_noise: 0.0, ..SceneSpec::default() });
     let options = AddPointsOptions::default();
     let table = views::ViewTable::new(&scene.posed, &options.triangulation, &options.pixel_scaling);
+    let star_of = |track: &[views::Sighting]| {
+        let link = |&seen: &views::Sighting| triangulate::Link { seen, distinctive: true };
+        let links: Vec<triangulate::Link> = track[1..].iter().map(link).collect();
+        triangulate::triangulate_star(&scene.posed, &table, track[0], &links)
+    };
     let mut tested = 0;
     for point in 0..60 {
         let track: Vec<views::Sighting> = (0..6)
@@ -296,13 +302,13 @@ fn triangulation_is_accurate_and_survives_a_wrong_match() {
             continue;
         }
         tested += 1;
-        let star = triangulate::triangulate_star(&scene.posed, &table, &track).unwrap();
+        let star = star_of(&track).unwrap();
         assert_eq!(star.sightings, track);
         assert!((star.xyz - scene.points[point]).norm() < 1e-4, "f32 keypoints");
         let mut spoiled = track.clone();
         let other = scene.keypoint_of(spoiled[2].rank as usize, point + 100).unwrap_or(0);
         spoiled[2].keypoint = KeypointIdx(other as u32);
-        let star = triangulate::triangulate_star(&scene.posed, &table, &spoiled).unwrap();
+        let star = star_of(&spoiled).unwrap();
         let expected: Vec<_> = track.iter().copied().filter(|seen| *seen != track[2]).collect();
         assert_eq!(star.sightings, expected);
         assert!((star.xyz - scene.points[point]).norm() < 1e-4);
@@ -321,10 +327,35 @@ fn merged(scene: &TestScene, model: &Reconstruction, stars: &[Vec<(usize, usize)
                 table.sighting(&scene.observation(image, scene.keypoint_of(image, point).unwrap()))
             };
             let sightings: Vec<_> = star.iter().map(sight).collect();
-            triangulate::StarTrack { sightings, xyz: scene.points[star[0].1], mean_relative_error_sq: 0.1 }
+            triangulate::StarTrack {
+                sightings,
+                xyz: scene.points[star[0].1],
+                distinctive: true,
+                mean_relative_error_sq: 0.1,
+            }
         })
         .collect();
     merge::merge_tracks(model, &table, &stars, &options.triangulation)
+}
+
+#[test]
+fn two_views_alone_need_a_distinctive_match() {
+    let scene = build(&SceneSpec { clutter: 0, ..SceneSpec::default() });
+    let p = well_seen(&scene, 0);
+    let options = AddPointsOptions::default();
+    let created = |images: &[u32], distinctive: bool| {
+        let keypoint = |image: u32| KeypointIdx(scene.keypoint_of(image as usize, p).unwrap() as u32);
+        let pairs: Vec<PairMatches> = images
+            .windows(2)
+            .map(|pair| PairMatches {
+                first: ImageId(pair[0]),
+                second: ImageId(pair[1]),
+                matches: vec![KeypointMatch { first: keypoint(pair[0]), second: keypoint(pair[1]), distinctive }],
+            })
+            .collect();
+        add_matches(&mut scene.posed.clone(), &pairs, &options).points_created
+    };
+    assert_eq!([created(&[0, 4], true), created(&[0, 4], false), created(&[0, 2, 4], false)], [1, 0, 1]);
 }
 
 /// A point that all six images show.

@@ -9,6 +9,7 @@
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::guided_match::KeypointMatch;
 use super::views::{Sighting, ViewTable};
@@ -16,13 +17,13 @@ use crate::geometry::triangulation::{refine_point, triangulate_dlt};
 use crate::scene::{ImageId, KeypointIdx, Reconstruction};
 
 /// The matches of one pair.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PairMatches {
     /// The first image.
     pub first: ImageId,
     /// The second.
     pub second: ImageId,
-    /// Keypoints of the first and of the second that belong together, each at most once.
+    /// Keypoints that belong together, each at most once.
     pub matches: Vec<KeypointMatch>,
 }
 
@@ -33,6 +34,8 @@ pub struct StarTrack {
     pub sightings: Vec<Sighting>,
     /// The point.
     pub xyz: Vector3<f64>,
+    /// Whether all matches it is made of are distinctive.
+    pub distinctive: bool,
     /// Mean of the squared errors, relative to what is allowed.
     pub mean_relative_error_sq: f64,
 }
@@ -59,13 +62,13 @@ fn stars_of_image(
     rank: u32,
     pairs: &[(usize, bool)],
 ) -> Vec<StarTrack> {
-    let mut links: Vec<(KeypointIdx, Sighting)> = Vec::new();
+    let mut links: Vec<(KeypointIdx, Link)> = Vec::new();
     for &(index, is_first) in pairs {
         let pair = &matches[index];
         let other = table.rank(if is_first { pair.second } else { pair.first }).expect("pairs were filtered by rank");
-        links.extend(pair.matches.iter().map(|&(a, b)| {
-            let (own, keypoint) = if is_first { (a, b) } else { (b, a) };
-            (own, Sighting { rank: other, keypoint })
+        links.extend(pair.matches.iter().map(|found| {
+            let (own, keypoint) = if is_first { (found.first, found.second) } else { (found.second, found.first) };
+            (own, Link { seen: Sighting { rank: other, keypoint }, distinctive: found.distinctive })
         }));
     }
     links.sort_unstable();
@@ -73,16 +76,30 @@ fn stars_of_image(
     let mut track = Vec::new();
     for links in links.chunk_by(|a, b| a.0 == b.0) {
         track.clear();
-        track.push(Sighting { rank, keypoint: links[0].0 });
-        track.extend(links.iter().map(|&(_, seen)| seen));
-        stars.extend(triangulate_star(model, table, &track));
+        track.extend(links.iter().map(|&(_, link)| link));
+        stars.extend(triangulate_star(model, table, Sighting { rank, keypoint: links[0].0 }, &track));
     }
     stars
 }
 
-/// The point that a star's query sees together with most of its matches; none when it agrees with none of them.
-pub fn triangulate_star(model: &Reconstruction, table: &ViewTable, track: &[Sighting]) -> Option<StarTrack> {
-    let query = track[0];
+/// A match of a query keypoint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Link {
+    /// The matched keypoint.
+    pub seen: Sighting,
+    /// Whether the match is distinctive ([`KeypointMatch::distinctive`]).
+    pub distinctive: bool,
+}
+
+/// The point that a star's query sees together with most of its matches (at most one an image, by rank); none when it agrees
+/// with none of them.
+pub fn triangulate_star(
+    model: &Reconstruction,
+    table: &ViewTable,
+    query: Sighting,
+    links: &[Link],
+) -> Option<StarTrack> {
+    let track: Vec<Sighting> = std::iter::once(query).chain(links.iter().map(|link| link.seen)).collect();
     let query_ray = table.ray(query);
     let known = track.iter().filter_map(|&seen| {
         let point = table.image(seen.rank).points()[seen.keypoint.index()]?;
@@ -104,7 +121,11 @@ pub fn triangulate_star(model: &Reconstruction, table: &ViewTable, track: &[Sigh
         return None;
     }
     let errors: f64 = sightings.iter().map(|&seen| table.relative_error_sq(seen, &xyz)).sum();
-    Some(StarTrack { mean_relative_error_sq: errors / sightings.len() as f64, sightings, xyz })
+    // Both lists are by rank, so each inlier's link is found in passing.
+    let mut links = links.iter();
+    let distinctive =
+        sightings[1..].iter().all(|seen| links.find(|link| link.seen == *seen).is_some_and(|link| link.distinctive));
+    Some(StarTrack { distinctive, mean_relative_error_sq: errors / sightings.len() as f64, sightings, xyz })
 }
 
 /// Rounds of [`refit`]: the inliers have settled after one or two.
