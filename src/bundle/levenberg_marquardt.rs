@@ -6,6 +6,9 @@
 
 use rayon::prelude::*;
 
+#[cfg(test)]
+mod tests;
+
 use super::back_substitution::{StepSums, step_points};
 use super::elimination::PartialSums;
 use super::options::{BundleOptions, StopReason};

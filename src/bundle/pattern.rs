@@ -213,9 +213,10 @@ impl Pattern {
         let mut before_word = vec![0; adjacency.bits.len()];
         for column in 0..problem.slots.len() {
             let mut before = 0;
-            for word in column * adjacency.words..(column + 1) * adjacency.words {
-                before_word[word] = before;
-                before += adjacency.bits[word].count_ones();
+            let range = column * adjacency.words..(column + 1) * adjacency.words;
+            for (before_word, word) in before_word[range.clone()].iter_mut().zip(&adjacency.bits[range]) {
+                *before_word = before;
+                before += word.count_ones();
             }
         }
         let locator = Locator::Sparse { adjacency, before_word, offsets, first };
