@@ -79,7 +79,9 @@ fn full_step(problem: &Problem, state: &State, loss: RobustLoss, damping: f64) -
 #[test]
 fn eliminating_the_points_gives_the_full_step() {
     for camera_model in CameraModel::ALL {
-        for (shared_camera, max_dense_unknowns) in [(true, 1000), (false, 1000), (true, 0), (false, 0)] {
+        let all = [(true, 0), (true, 1000), (false, 1000), (false, 0)];
+        let count = if camera_model == CameraModel::OpenCv { all.len() } else { 1 };
+        for &(shared_camera, max_dense_unknowns) in &all[..count] {
             let scene = SceneOptions {
                 camera_model,
                 shared_camera,
