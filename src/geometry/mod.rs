@@ -4,6 +4,7 @@
 //! Angles are radians unless a name ends in `_deg`.
 
 pub mod epipolar;
+pub mod focal_voting;
 pub mod homography;
 mod rigid3;
 pub mod triangulation;
