@@ -11,7 +11,11 @@ const PREVIEWS = 11;
 /** How often the list of jobs is asked for again. */
 const REFRESH_MS = 4000;
 
+/** The panel for a new job outlives the view: an upload goes on while another job is looked at. */
+let panelForNew = null;
+
 export function homeView(main) {
+  panelForNew ??= newJob();
   document.title = "Multistage";
   const jobs = jobList();
   main.append(
@@ -19,7 +23,7 @@ export function homeView(main) {
       h("section", { "aria-labelledby": "new-title" },
         h("h1", { id: "new-title" }, "A model from photographs"),
         h("p", { class: "lead" }, "Give a folder of pictures of one place or object, taken from many sides with plenty of overlap. You get a coloured point cloud, the position of every camera, and a verdict on every picture."),
-        newJob()),
+        panelForNew),
       jobs.element));
   return { close: jobs.close };
 }
@@ -67,11 +71,7 @@ function newJob() {
     if (panel.isConnected) event.preventDefault();
   };
   const onDrop = async (event) => {
-    if (!panel.isConnected) {
-      removeEventListener("dragover", onDragOver);
-      removeEventListener("drop", onDrop);
-      return;
-    }
+    if (!panel.isConnected) return;
     event.preventDefault();
     panel.querySelector(".drop")?.classList.remove("over");
     if (upload) return;
@@ -163,7 +163,11 @@ function newJob() {
       const dataset = await upload.run();
       const job = await upload.persist(() => createJob({ dataset_id: dataset.id, ...(name ? { name } : {}), options }));
       announce("Uploaded. The job is queued.");
-      location.hash = `#/jobs/${job.id}`;
+      upload = null;
+      selection = new Selection();
+      const watched = panel.isConnected;
+      showChoice();
+      if (watched) location.hash = `#/jobs/${job.id}`;
     } catch (problem) {
       const failed = upload;
       upload = null;

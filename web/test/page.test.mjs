@@ -124,6 +124,31 @@ test("a problem that won't pass is shown, and can be tried again", { skip }, () 
   await page.locator('.viewer[data-state="shown"]').waitFor();
 }));
 
+test("an upload goes on while another job is looked at", { skip }, () => onMock({
+  stage_ms: 50,
+  fail: (method, path, nth) => (method === "POST" && path.endsWith("/images") && nth > 1 && nth < 4 ? 503 : undefined),
+}, async (page, mock) => {
+  const start = async () => {
+    await choose(page);
+    await page.getByRole("button", { name: "Upload and reconstruct" }).click();
+  };
+  await start();
+  await page.locator(".job-head .badge.succeeded").waitFor();
+  await page.getByRole("link", { name: "All jobs" }).click();
+  await start();
+  await page.getByText("Trying again").waitFor();
+  await page.locator(".job-list a").first().click();
+  await page.locator(".job-head .badge.succeeded").waitFor();
+  const looked = page.url();
+  for (let k = 0; k < 200 && mock.seen.get("POST /api/v1/jobs") < 2; k += 1) await page.waitForTimeout(100);
+  await page.waitForTimeout(300);
+  assert.equal(page.url(), looked, "the view is not taken away");
+  await page.getByRole("link", { name: "All jobs" }).click();
+  await page.locator(".job-list a").nth(1).waitFor();
+  assert.equal(mock.datasets.size, 2);
+  assert.equal(await page.getByText("Drop pictures or a folder here").count(), 1);
+}));
+
 test("options that are no JSON object are refused before anything is sent", { skip }, () => onMock({}, async (page, mock) => {
   await choose(page);
   await page.getByText("Options", { exact: true }).click();
