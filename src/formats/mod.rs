@@ -4,6 +4,7 @@ pub mod bundler;
 pub mod colmap;
 mod error;
 pub mod exif;
+pub mod features;
 pub mod photograph;
 pub mod ply;
 pub mod report;

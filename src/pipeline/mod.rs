@@ -1,9 +1,26 @@
 //! The runner: order of the stages, units of work, options, progress, resume and the report.
 
+mod coarse;
+mod colors;
 mod context;
 mod error;
+mod export;
+mod features;
+mod focals;
+mod intake;
+mod localise;
+mod measure;
+mod options;
+mod refine;
+mod report;
+mod run;
+mod runner;
 mod stage;
+mod state;
+mod verdict;
 
 pub use context::{CancelFlag, Context, NoProgress, ProgressEvent, ProgressSink};
 pub use error::PipelineError;
+pub use options::{CoarseOptions, IntakeOptions, KnownCamera, ReconstructionOptions, RefineOptions};
+pub use run::{RunPaths, reconstruct};
 pub use stage::{Stage, StageKey};

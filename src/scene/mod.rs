@@ -4,6 +4,7 @@ mod features;
 mod ids;
 mod raster;
 mod reconstruction;
+pub mod world_frame;
 
 pub use features::{DESCRIPTOR_LEN, Descriptor, Features, Keypoint};
 pub use ids::{CameraId, ImageId, KeypointIdx, Point3dId};

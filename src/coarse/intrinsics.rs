@@ -1,0 +1,90 @@
+//! Which intrinsics the photographs can tell.
+//!
+//! A focal length needs a few images; a principal point needs many that share the camera (a shift of the principal point and
+//! a small rotation look alike in one image); distortion comes between. What can't be told stays at its prior.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::bundle::FreeIntrinsics;
+use crate::camera::{CameraModel, FocalSource};
+use crate::scene::{CameraId, Reconstruction};
+
+/// How many images sharing a camera it takes to free its parameters.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct IntrinsicsOptions {
+    /// Images in the model before any focal length is freed; two views leave it badly determined.
+    pub min_model_images_for_focal: usize,
+    /// Images in the model before distortion is freed.
+    pub min_model_images_for_distortion: usize,
+    /// Images sharing a camera before its principal point is freed.
+    pub min_images_for_principal_point: usize,
+    /// Images sharing a camera before it gets two radial coefficients.
+    pub min_images_for_radial: usize,
+    /// Images sharing a camera before it gets two focal lengths and tangential distortion as well.
+    pub min_images_for_opencv: usize,
+    /// Whether intrinsics are refined at all (known ones never are).
+    pub refine: bool,
+}
+
+impl Default for IntrinsicsOptions {
+    fn default() -> Self {
+        Self {
+            min_model_images_for_focal: 3,
+            min_model_images_for_distortion: 4,
+            min_images_for_principal_point: 8,
+            min_images_for_radial: 4,
+            min_images_for_opencv: 8,
+            refine: true,
+        }
+    }
+}
+
+/// The parameters to free of every camera a model uses.
+pub fn free_intrinsics(model: &Reconstruction, options: &IntrinsicsOptions) -> BTreeMap<CameraId, FreeIntrinsics> {
+    let images = model.images().len();
+    let free = |id: CameraId, sharing: usize| {
+        if !options.refine || model.cameras[&id].focal_source == FocalSource::Known {
+            return FreeIntrinsics::default();
+        }
+        FreeIntrinsics {
+            focal: images >= options.min_model_images_for_focal,
+            distortion: images >= options.min_model_images_for_distortion,
+            principal_point: sharing >= options.min_images_for_principal_point,
+        }
+    };
+    sharing(model).into_iter().map(|(id, sharing)| (id, free(id, sharing))).collect()
+}
+
+/// How many images of a model use each camera.
+fn sharing(model: &Reconstruction) -> BTreeMap<CameraId, usize> {
+    let mut sharing = BTreeMap::new();
+    for image in model.images().values() {
+        *sharing.entry(image.camera).or_insert(0) += 1;
+    }
+    sharing
+}
+
+/// Gives every camera of a model as rich a camera model as its images determine.
+pub fn enrich_cameras(model: &mut Reconstruction, options: &IntrinsicsOptions) {
+    let sharing = sharing(model);
+    for (id, camera) in &mut model.cameras {
+        let richest = richest_model(sharing.get(id).copied().unwrap_or(0), options);
+        if camera.focal_source != FocalSource::Known && richest > camera.model {
+            *camera = camera.with_model(richest);
+        }
+    }
+}
+
+/// The model that as many images determine.
+fn richest_model(sharing: usize, options: &IntrinsicsOptions) -> CameraModel {
+    if sharing >= options.min_images_for_opencv {
+        CameraModel::OpenCv
+    } else if sharing >= options.min_images_for_radial {
+        CameraModel::Radial
+    } else {
+        CameraModel::SimpleRadial
+    }
+}

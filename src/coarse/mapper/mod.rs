@@ -1,0 +1,242 @@
+//! Incremental structure from motion on the match graph: initial pair, next-best image, pose, triangulation, local and global
+//! bundle adjustment, filtering. One model per connected component, and further models from the images the first left over.
+//!
+//! Snavely, Seitz, Szeliski, "Photo Tourism", 2006; Schönberger, Frahm, "Structure-from-Motion Revisited", CVPR 2016 (the
+//! pyramid score of the next image, retriangulation, iterated adjustment and filtering).
+
+mod adjust;
+mod initial;
+mod options;
+mod register;
+mod triangulate;
+
+pub use options::MapperOptions;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use super::{MatchGraph, Tracks};
+use crate::camera::{Camera, Pixel};
+use crate::scene::{CameraId, ImageId, Point3dId, Reconstruction};
+
+/// What the mapper is told of an image.
+#[derive(Clone, Debug)]
+pub struct MapperImage {
+    /// Its intrinsics.
+    pub camera: CameraId,
+    /// The position of every keypoint.
+    pub keypoints: Arc<[Pixel]>,
+}
+
+/// The input of the mapper.
+#[derive(Clone, Debug)]
+pub struct MapperInput {
+    /// Every image that may be registered.
+    pub images: BTreeMap<ImageId, MapperImage>,
+    /// Intrinsics to start from.
+    pub cameras: BTreeMap<CameraId, Camera>,
+    /// Verified pairs.
+    pub graph: MatchGraph,
+}
+
+/// Why the mapper left an image out.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Unregistered {
+    /// No pair with it was verified.
+    NoPairs,
+    /// Its component gave no model: no pair of it could start one.
+    NoInitialPair,
+    /// It sees too few points of the model.
+    TooFewPoints {
+        /// Points it sees.
+        visible: usize,
+    },
+    /// No pose agreed with enough of the points it sees.
+    PoseFailed {
+        /// Points it sees.
+        visible: usize,
+        /// Those the best pose agreed with.
+        inliers: usize,
+    },
+}
+
+/// The models of all components.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct CoarseModels {
+    /// Largest first.
+    pub models: Vec<Reconstruction>,
+    /// Why each other image is in none.
+    pub unregistered: BTreeMap<ImageId, Unregistered>,
+}
+
+/// Reconstructs every component of the graph. `keep_going` is asked between registrations; once it says no, what there is so
+/// far is returned. `progress` is told the number of images registered.
+pub fn reconstruct(
+    input: &MapperInput,
+    options: &MapperOptions,
+    seed: u64,
+    keep_going: &(dyn Fn() -> bool + Sync),
+    progress: &(dyn Fn(usize) + Sync),
+) -> CoarseModels {
+    let mut result = CoarseModels::default();
+    for &image in input.images.keys() {
+        result.unregistered.insert(image, Unregistered::NoPairs);
+    }
+    for component in input.graph.components() {
+        let mut remaining = component;
+        while remaining.len() >= options.min_model_images && keep_going() {
+            for &image in &remaining {
+                result.unregistered.entry(image).and_modify(|why| {
+                    if *why == Unregistered::NoPairs {
+                        *why = Unregistered::NoInitialPair;
+                    }
+                });
+            }
+            let done: usize = result.models.iter().map(|model| model.images().len()).sum();
+            let told = |registered: usize| progress(done + registered);
+            let Some((model, reasons)) = best_model(input, &remaining, options, seed, keep_going, &told) else { break };
+            for (image, reason) in reasons {
+                result.unregistered.insert(image, reason);
+            }
+            for image in model.images().keys() {
+                remaining.remove(image);
+                result.unregistered.remove(image);
+            }
+            result.models.push(model);
+            let connected = input.graph.restricted_to(&remaining).components();
+            remaining = connected.into_iter().next().unwrap_or_default();
+        }
+    }
+    result.models.sort_by_key(|model| std::cmp::Reverse((model.images().len(), model.num_points())));
+    result
+}
+
+/// The best model of a component over a few initial pairs: the first that registers a satisfying share of the images, else
+/// the one with most.
+fn best_model(
+    input: &MapperInput,
+    component: &BTreeSet<ImageId>,
+    options: &MapperOptions,
+    seed: u64,
+    keep_going: &(dyn Fn() -> bool + Sync),
+    progress: &(dyn Fn(usize) + Sync),
+) -> Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> {
+    let graph = input.graph.restricted_to(component);
+    let tracks = Tracks::build(&graph);
+    let mut used_starts = BTreeSet::new();
+    let mut best: Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> = None;
+    for _ in 0..options.max_starts {
+        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, seed);
+        if !mapper.start(&mut used_starts) {
+            break;
+        }
+        mapper.grow(keep_going, progress);
+        let registered = mapper.model.images().len();
+        if registered >= options.min_model_images
+            && best.as_ref().is_none_or(|(model, _)| registered > model.images().len())
+        {
+            let reasons = mapper.reasons();
+            best = Some((mapper.model, reasons));
+        }
+        if registered as f64 >= options.satisfied_share * component.len() as f64 || !keep_going() {
+            break;
+        }
+    }
+    best
+}
+
+/// A model that grows.
+pub(super) struct Mapper<'a> {
+    input: &'a MapperInput,
+    graph: &'a MatchGraph,
+    tracks: &'a Tracks,
+    component: &'a BTreeSet<ImageId>,
+    options: &'a MapperOptions,
+    seed: u64,
+    model: Reconstruction,
+    /// The last point each track was given; it may have been filtered since.
+    point_of_track: Vec<Option<Point3dId>>,
+    trials: BTreeMap<ImageId, u32>,
+    failures: BTreeMap<ImageId, Unregistered>,
+}
+
+impl<'a> Mapper<'a> {
+    fn new(
+        input: &'a MapperInput,
+        graph: &'a MatchGraph,
+        tracks: &'a Tracks,
+        component: &'a BTreeSet<ImageId>,
+        options: &'a MapperOptions,
+        seed: u64,
+    ) -> Self {
+        Self {
+            input,
+            graph,
+            tracks,
+            component,
+            options,
+            seed,
+            model: Reconstruction::new(input.cameras.clone()),
+            point_of_track: vec![None; tracks.tracks.len()],
+            trials: BTreeMap::new(),
+            failures: BTreeMap::new(),
+        }
+    }
+
+    /// Registers image after image until none can be, then adjusts everything.
+    fn grow(&mut self, keep_going: &(dyn Fn() -> bool + Sync), progress: &(dyn Fn(usize) + Sync)) {
+        let mut adjusted_at = (self.model.images().len(), self.model.num_points());
+        let mut min_inliers = self.options.min_pose_inliers;
+        while keep_going() {
+            progress(self.model.images().len());
+            let Some(image) = self.register_next(min_inliers) else {
+                let size = (self.model.images().len(), self.model.num_points());
+                if adjusted_at.0 != size.0 {
+                    self.adjust_globally();
+                    adjusted_at = (self.model.images().len(), self.model.num_points());
+                } else if min_inliers > self.options.min_pose_inliers_relaxed {
+                    min_inliers = self.options.min_pose_inliers_relaxed;
+                } else {
+                    break;
+                }
+                self.trials.clear();
+                continue;
+            };
+            self.triangulate_image(image);
+            self.adjust_locally(image);
+            let size = (self.model.images().len(), self.model.num_points());
+            let grown = |now: usize, then: usize| now as f64 >= self.options.global_growth * then as f64;
+            if grown(size.0, adjusted_at.0) || grown(size.1, adjusted_at.1) {
+                self.adjust_globally();
+                adjusted_at = (self.model.images().len(), self.model.num_points());
+            }
+        }
+        self.finish();
+    }
+
+    /// Triangulates and completes the tracks of an image.
+    fn triangulate_image(&mut self, image: ImageId) {
+        let mut tracks: Vec<usize> = self.tracks.of(image).iter().map(|&(_, track)| track).collect();
+        tracks.sort_unstable();
+        self.triangulate_tracks(&tracks);
+    }
+
+    /// The largest reprojection error allowed in an image of a camera.
+    fn max_error_px(&self, camera: &Camera) -> f64 {
+        self.options.keep_limits().max_error_px(camera)
+    }
+
+    /// Why the component's other images are not in the model.
+    fn reasons(&self) -> BTreeMap<ImageId, Unregistered> {
+        let missing = self.component.iter().filter(|image| self.model.image(**image).is_none());
+        missing
+            .map(|&image| {
+                let visible = self.visible_points(image).len();
+                (image, self.failures.get(&image).cloned().unwrap_or(Unregistered::TooFewPoints { visible }))
+            })
+            .collect()
+    }
+}

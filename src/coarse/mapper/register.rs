@@ -1,0 +1,115 @@
+//! The next image and its pose.
+
+use nalgebra::Vector3;
+
+use super::{Mapper, Unregistered};
+use crate::camera::{FocalSource, Pixel};
+use crate::math::Rng;
+use crate::ransac::absolute_pose;
+use crate::scene::{ImageId, KeypointIdx, Observation, Point3dId};
+
+/// Levels of the pyramid whose occupied cells score how evenly an image sees the model.
+const PYRAMID_LEVELS: u32 = 6;
+/// Tells the random streams of this stage from others.
+const STREAM: u64 = 0x7265_6769_7374_6572;
+
+impl Mapper<'_> {
+    /// The keypoints of an image whose tracks have a point the image is not yet a sighting of.
+    pub(super) fn visible_points(&self, image: ImageId) -> Vec<(KeypointIdx, Point3dId)> {
+        self.tracks
+            .of(image)
+            .iter()
+            .filter_map(|&(keypoint, track)| Some((keypoint, self.live_point(track)?)))
+            .collect()
+    }
+
+    /// Registers the image that sees the model best; tries the others in turn when its pose fails. None when no image can be
+    /// registered.
+    pub(super) fn register_next(&mut self, min_inliers: usize) -> Option<ImageId> {
+        let mut ranking: Vec<(u64, ImageId)> = Vec::new();
+        for &image in self.component {
+            let spent = self.trials.get(&image).copied().unwrap_or(0) >= self.options.max_registration_trials;
+            if self.model.image(image).is_some() || spent {
+                continue;
+            }
+            let visible = self.visible_points(image);
+            if visible.len() >= self.options.min_visible_points {
+                ranking.push((self.visibility_score(image, &visible), image));
+            } else {
+                self.failures.insert(image, Unregistered::TooFewPoints { visible: visible.len() });
+            }
+        }
+        ranking.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
+        ranking.into_iter().map(|(_, image)| image).find(|&image| self.try_register(image, min_inliers))
+    }
+
+    /// Schönberger and Frahm's score: over pyramid levels of 2^l x 2^l cells, the occupied cells weighted by their number a
+    /// side, so that points spread over the image count more than as many in one corner.
+    fn visibility_score(&self, image: ImageId, visible: &[(KeypointIdx, Point3dId)]) -> u64 {
+        let input = &self.input.images[&image];
+        let camera = &self.input.cameras[&input.camera];
+        let side = 1usize << PYRAMID_LEVELS;
+        let mut occupied = vec![false; side * side];
+        for &(keypoint, _) in visible {
+            let at = input.keypoints[keypoint.index()].0;
+            let cell = |x: f64, size: u32| ((x / f64::from(size) * side as f64) as usize).min(side - 1);
+            occupied[cell(at.y, camera.height) * side + cell(at.x, camera.width)] = true;
+        }
+        let mut score = 0;
+        let mut width = side;
+        while width > 1 {
+            score += (occupied.iter().filter(|&&cell| cell).count() * width) as u64;
+            let half = width / 2;
+            let mut coarser = vec![false; half * half];
+            for row in 0..width {
+                for column in 0..width {
+                    coarser[(row / 2) * half + column / 2] |= occupied[row * width + column];
+                }
+            }
+            occupied = coarser;
+            width = half;
+        }
+        score
+    }
+
+    /// Estimates the pose of an image from the points it sees and registers it.
+    fn try_register(&mut self, image: ImageId, min_inliers: usize) -> bool {
+        let trial = self.trials.entry(image).or_insert(0);
+        *trial += 1;
+        let trial = *trial;
+        let visible = self.visible_points(image);
+        let input = &self.input.images[&image];
+        let points: Vec<Vector3<f64>> =
+            visible.iter().map(|&(_, id)| self.model.point(id).map(|point| point.xyz).unwrap_or_default()).collect();
+        let pixels: Vec<Pixel> = visible.iter().map(|&(keypoint, _)| input.keypoints[keypoint.index()]).collect();
+        let sharing = self.model.images().values().filter(|other| other.camera == input.camera).count();
+        let mut camera = self.model.cameras[&input.camera].clone();
+        if sharing >= 2 {
+            camera.focal_source = camera.focal_source.max(FocalSource::Estimated);
+        }
+        let scale = self.options.keep_limits().threshold_scale(&camera);
+        let mut options = self.options.pose.clone();
+        options.threshold_px *= scale;
+        options.min_inliers = min_inliers;
+        let mut rng = Rng::from_parts(&[self.seed, STREAM, u64::from(image.0), u64::from(trial)]);
+        let Some(pose) = absolute_pose::estimate(&points, &pixels, &camera, &options, &mut rng) else {
+            self.failures.insert(image, Unregistered::PoseFailed { visible: visible.len(), inliers: 0 });
+            return false;
+        };
+        if sharing == 0 {
+            self.model.cameras.insert(input.camera, pose.camera);
+        }
+        self.model.register(image, input.camera, pose.cam_from_world, input.keypoints.clone());
+        for (&(keypoint, point), &inlier) in visible.iter().zip(&pose.inliers) {
+            let seen = Observation { image, keypoint };
+            if inlier {
+                self.model.add_observation(point, seen);
+                if self.model.reprojection_error_px(point, seen) > self.max_error_px(&camera) {
+                    self.model.remove_observation(point, seen);
+                }
+            }
+        }
+        self.failures.remove(&image);
+        true
+    }
+}

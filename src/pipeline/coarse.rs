@@ -1,0 +1,307 @@
+//! The stages `coarse_match` and `coarse_model`, widened when the largest scales alone do not connect enough images.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::features::{FeatureCache, ImageFeatures};
+use super::intake::Intake;
+use super::options::{CoarseOptions, ReconstructionOptions};
+use super::run::key;
+use super::runner::{ArtifactKey, Counts, Runner, StageProgress, counts};
+use super::state::{ModelState, PipelineState};
+use super::{Context, PipelineError, Stage, StageKey, focals};
+use crate::add_cameras::MatchCounts;
+use crate::camera::{Camera, FocalSource, Pixel};
+use crate::coarse::hybrid_match::{CoarseDescriptors, match_hybrid};
+use crate::coarse::pair_selection::{GeoPosition, PairingImage, select_pairs};
+use crate::coarse::selection::SelectionOptions;
+use crate::coarse::{self, CoarseModels, MapperImage, MapperInput, MatchGraph};
+use crate::matching::two_view::{self, TwoViewGeometry};
+use crate::math::Rng;
+use crate::scene::{CameraId, ImageId, KeypointIdx};
+
+/// Number of coarse matches of every pair that was matched, verified or not: what ranked matching goes by.
+pub type PairMatchCounts = MatchCounts;
+
+/// What the coarse stages leave.
+pub struct Coarse {
+    /// The models and the images without one.
+    pub state: PipelineState,
+    /// Coarse matches of every pair.
+    pub match_counts: PairMatchCounts,
+    /// Intrinsics as far as the pairs tell them.
+    pub cameras: BTreeMap<CameraId, Camera>,
+}
+
+/// The result of `coarse_match`.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+struct CoarseMatches {
+    graph: MatchGraph,
+    match_counts: PairMatchCounts,
+    cameras: BTreeMap<CameraId, Camera>,
+    notes: Vec<String>,
+}
+
+/// Tells the random streams of verification from others.
+const STREAM: u64 = 0x7477_6f5f_7669_6577;
+/// Memory for features read for their positions; they are read once here, so little is kept.
+const POSITION_CACHE_BYTES: usize = 64 << 20;
+
+/// Matches and reconstructs the largest scales; widens the selection while too few images are registered and keeps the best.
+pub fn run(
+    runner: &mut Runner<'_>,
+    intake: &Intake,
+    found: &BTreeMap<ImageId, ImageFeatures>,
+    options: &ReconstructionOptions,
+    base_key: &ArtifactKey,
+    notes: &mut Vec<String>,
+) -> Result<Coarse, PipelineError> {
+    let context = runner.context;
+    let usable = found.values().filter(|image| matches!(image.count, Ok(count) if count > 0)).count();
+    let mut best: Option<(usize, CoarseModels)> = None;
+    let mut before = CoarseMatches::default();
+    let selections = std::iter::successors(Some(options.coarse.selection.clone()), SelectionOptions::widened);
+    for (round, selection) in (1u32..).zip(selections) {
+        let iteration = (round > 1).then_some(round);
+        let settled = best
+            .as_ref()
+            .and_then(|(_, models)| models.models.first())
+            .map(|model| model.images().keys().copied().collect());
+        let match_key = ArtifactKey::of("coarse_match", &[&base_key.0, &selection]);
+        let matches: CoarseMatches = runner.stage(
+            StageKey { stage: Stage::CoarseMatch, iteration },
+            Some(&match_key),
+            0,
+            |store, progress| {
+                let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
+                let matcher =
+                    Matcher { intake, found, options: &options.coarse, selection: &selection, cache: &cache, context };
+                let result = matcher.run(&before, &settled.unwrap_or_default(), progress)?;
+                cache.check(Stage::CoarseMatch)?;
+                Ok(result)
+            },
+        )?;
+        let model_key = ArtifactKey::of("coarse_model", &[&match_key.0]);
+        let stage = StageKey { stage: Stage::CoarseModel, iteration };
+        let models: CoarseModels = runner.stage(stage, Some(&model_key), usable as u64, |store, progress| {
+            let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
+            let input = mapper_input(intake, &cache, &matches);
+            cache.check(Stage::CoarseModel)?;
+            let keep_going = || !context.cancel.is_cancelled();
+            let told = |registered: usize| progress.set(registered as u64, usable as u64);
+            let models = coarse::reconstruct(&input, &options.coarse.mapper, context.seed, &keep_going, &told);
+            context.check_cancelled()?;
+            let points = models.models.iter().map(|model| model.num_points()).sum();
+            let totals = counts([("images", registered(&models)), ("models", models.models.len()), ("points", points)]);
+            Ok((models, totals))
+        })?;
+        for note in &matches.notes {
+            if !notes.contains(note) {
+                notes.push(note.clone());
+            }
+        }
+        let largest = |models: &CoarseModels| models.models.first().map_or(0, |model| model.images().len());
+        let reached = largest(&models);
+        if best.as_ref().is_none_or(|(_, best)| (reached, registered(&models)) > (largest(best), registered(best))) {
+            best = Some((round as usize, models));
+        }
+        before = matches;
+        if reached as f64 >= options.coarse.enough_registered * usable as f64 {
+            break;
+        }
+        notes.push(format!(
+            "With the {:.0} % of the features of largest scale, {reached} of {usable} photographs came into the largest coarse model.",
+            selection.eta_percent
+        ));
+    }
+    let models = best.map(|(_, models)| models).unwrap_or_default();
+    let mut state = PipelineState {
+        models: models
+            .models
+            .into_iter()
+            .map(|model| ModelState { model, registered_in: BTreeMap::new(), history: Vec::new() })
+            .collect(),
+        unregistered: models.unregistered,
+    };
+    state.record(key(Stage::CoarseModel));
+    Ok(Coarse { state, match_counts: before.match_counts, cameras: before.cameras })
+}
+
+fn registered(models: &CoarseModels) -> usize {
+    models.models.iter().map(|model| model.images().len()).sum()
+}
+
+fn mapper_input(intake: &Intake, cache: &FeatureCache<'_>, matches: &CoarseMatches) -> MapperInput {
+    let images = intake.photographs().map(|(id, _, photograph)| {
+        let camera = photograph.camera;
+        (id, MapperImage { camera, keypoints: positions(cache, id) })
+    });
+    MapperInput { images: images.collect(), cameras: matches.cameras.clone(), graph: matches.graph.clone() }
+}
+
+/// The position of every keypoint of an image.
+fn positions(cache: &FeatureCache<'_>, id: ImageId) -> Arc<[Pixel]> {
+    let features = cache.read(id, None);
+    features.keypoints.iter().map(|keypoint| Pixel::new(f64::from(keypoint.x), f64::from(keypoint.y))).collect()
+}
+
+/// One run of `coarse_match`.
+struct Matcher<'a> {
+    intake: &'a Intake,
+    found: &'a BTreeMap<ImageId, ImageFeatures>,
+    options: &'a CoarseOptions,
+    selection: &'a SelectionOptions,
+    cache: &'a FeatureCache<'a>,
+    context: &'a Context,
+}
+
+/// The selected features of an image.
+struct Selected {
+    descriptors: CoarseDescriptors,
+    pixels: Vec<Pixel>,
+    camera: CameraId,
+    position: Option<GeoPosition>,
+}
+
+impl Matcher<'_> {
+    /// Matches and verifies the selected pairs. Pairs between `settled` images, which one model already holds, keep what an
+    /// earlier, narrower round found.
+    fn run(
+        &self,
+        before: &CoarseMatches,
+        settled: &BTreeSet<ImageId>,
+        progress: &StageProgress<'_>,
+    ) -> Result<(CoarseMatches, Counts), PipelineError> {
+        let images = self.select();
+        let pairing: Vec<PairingImage<'_>> = images
+            .iter()
+            .map(|(&id, selected)| PairingImage {
+                id,
+                descriptors: selected.descriptors.descriptors(),
+                position: selected.position,
+            })
+            .collect();
+        let pairs: Vec<(ImageId, ImageId)> = select_pairs(&pairing, &self.options.pairs)
+            .into_keys()
+            .filter(|(a, b)| !(settled.contains(a) && settled.contains(b)))
+            .collect();
+        let matched: Vec<Option<(u32, Option<TwoViewGeometry>)>> = pairs
+            .par_iter()
+            .enumerate()
+            .map(|(at, &(a, b))| {
+                if self.context.cancel.is_cancelled() {
+                    return None;
+                }
+                let (in_a, in_b) = (&images[&a], &images[&b]);
+                let matches = match_hybrid(&in_a.descriptors, &in_b.descriptors, &self.options.matching).matches;
+                let geometry = self.verify((a, b), (in_a, in_b), &matches, &self.intake.cameras);
+                progress.set(at as u64, pairs.len() as u64);
+                Some((matches.len() as u32, geometry))
+            })
+            .collect();
+        self.context.check_cancelled()?;
+
+        let mut result = CoarseMatches {
+            graph: before.graph.clone(),
+            match_counts: before.match_counts.clone(),
+            ..Default::default()
+        };
+        let (mut tentative, mut verified) = (0, 0);
+        for (&pair, outcome) in pairs.iter().zip(matched) {
+            let Some((count, geometry)) = outcome else { continue };
+            tentative += usize::from(count > 0);
+            result.match_counts.insert(pair, count);
+            if let Some(geometry) = geometry {
+                verified += 1;
+                result.graph.pairs.insert(pair, geometry);
+            }
+        }
+        result.cameras = if before.cameras.is_empty() {
+            let mut cameras = self.intake.cameras.clone();
+            result.notes = focals::settle(&result.graph, &mut cameras, &images_cameras(&images), &self.options.focals);
+            cameras
+        } else {
+            before.cameras.clone()
+        };
+        self.reverify(&mut result, &images);
+        let inliers = result.graph.pairs.values().map(|geometry| geometry.inliers.len()).sum();
+        let selected = images.values().map(|selected| selected.pixels.len()).sum();
+        let totals = counts([
+            ("pairs_tried", pairs.len()),
+            ("pairs_matched", tentative),
+            ("pairs_verified", verified),
+            ("features_selected", selected),
+            ("inlier_matches", inliers),
+        ]);
+        Ok((result, totals))
+    }
+
+    /// Reads the features of largest scale of every image.
+    fn select(&self) -> BTreeMap<ImageId, Selected> {
+        let photographs: Vec<_> = self.intake.photographs().collect();
+        let read = photographs.par_iter().filter_map(|(id, _, photograph)| {
+            let count = *self.found.get(id)?.count.as_ref().ok()?;
+            let features = self.cache.read(*id, Some(self.selection.num_selected(count)));
+            let pixels =
+                features.keypoints.iter().map(|keypoint| Pixel::new(f64::from(keypoint.x), f64::from(keypoint.y)));
+            let selected = Selected {
+                pixels: pixels.collect(),
+                descriptors: CoarseDescriptors::new(&features.descriptors),
+                camera: photograph.camera,
+                position: photograph
+                    .exif
+                    .gps
+                    .as_ref()
+                    .map(|gps| GeoPosition { latitude_deg: gps.latitude_deg, longitude_deg: gps.longitude_deg }),
+            };
+            Some((*id, selected))
+        });
+        read.collect::<Vec<_>>().into_iter().collect()
+    }
+
+    fn verify(
+        &self,
+        (a, b): (ImageId, ImageId),
+        (in_a, in_b): (&Selected, &Selected),
+        matches: &[(KeypointIdx, KeypointIdx)],
+        cameras: &BTreeMap<CameraId, Camera>,
+    ) -> Option<TwoViewGeometry> {
+        let mut rng = Rng::from_parts(&[self.context.seed, STREAM, u64::from(a.0), u64::from(b.0)]);
+        let (camera_a, camera_b) = (&cameras[&in_a.camera], &cameras[&in_b.camera]);
+        two_view::verify(&in_a.pixels, &in_b.pixels, matches, camera_a, camera_b, &self.options.two_view, &mut rng)
+    }
+
+    /// Verifies those pairs again, as calibrated, whose focal lengths were not trusted the first time, so that they have
+    /// relative poses. A focal length that is still a guess is taken for the moment: poses from it are rough but can start a
+    /// model, which then refines it.
+    fn reverify(&self, result: &mut CoarseMatches, images: &BTreeMap<ImageId, Selected>) {
+        let mut cameras = result.cameras.clone();
+        for camera in cameras.values_mut() {
+            camera.focal_source = camera.focal_source.max(FocalSource::Estimated);
+        }
+        let trusted = |id: &ImageId| {
+            let camera = &images[id].camera;
+            let before = &self.intake.cameras[camera];
+            before.focal_source >= FocalSource::Exif && before == &result.cameras[camera]
+        };
+        let graph = &mut result.graph;
+        let pending: Vec<(ImageId, ImageId)> =
+            graph.pairs.keys().filter(|(a, b)| !(trusted(a) && trusted(b))).copied().collect();
+        let verified: Vec<Option<TwoViewGeometry>> = pending
+            .par_iter()
+            .map(|&(a, b)| self.verify((a, b), (&images[&a], &images[&b]), &graph.pairs[&(a, b)].inliers, &cameras))
+            .collect();
+        for (pair, geometry) in pending.into_iter().zip(verified) {
+            if let Some(geometry) = geometry {
+                graph.pairs.insert(pair, geometry);
+            }
+        }
+    }
+}
+
+fn images_cameras(images: &BTreeMap<ImageId, Selected>) -> BTreeMap<ImageId, CameraId> {
+    images.iter().map(|(&id, selected)| (id, selected.camera)).collect()
+}

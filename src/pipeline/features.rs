@@ -1,0 +1,182 @@
+//! The features stage: decode, shrink, SIFT, one stored file an image. Memory holds only what the worker threads work on.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::intake::{Intake, Refusal, advice};
+use super::options::ReconstructionOptions;
+use super::runner::{ArtifactKey, Counts, StageProgress, counts, io_error};
+use super::{Context, PipelineError, Stage};
+use crate::features::extract;
+use crate::formats::features as feature_file;
+use crate::formats::photograph::Photograph;
+use crate::scene::{Features, ImageId};
+use crate::store::ArtifactStore;
+
+/// The features of one image: where they are kept and how many there are, or why there are none.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct ImageFeatures {
+    /// Key of the feature file.
+    pub key: String,
+    /// Number of features, or why the picture can't be used after all.
+    pub count: Result<usize, Refusal>,
+}
+
+/// Extracts the features of every photograph that has none stored yet.
+///
+/// # Errors
+/// Cancellation, or a feature file that can't be stored.
+pub fn run(
+    folder: &Path,
+    intake: &Intake,
+    options: &ReconstructionOptions,
+    context: &Context,
+    store: &ArtifactStore,
+    progress: &StageProgress<'_>,
+) -> Result<(BTreeMap<ImageId, ImageFeatures>, Counts), PipelineError> {
+    let photographs: Vec<_> = intake.photographs().collect();
+    let extracted: Vec<Result<(ImageId, ImageFeatures, bool), PipelineError>> = photographs
+        .par_iter()
+        .map(|(id, file, _)| {
+            context.check_cancelled()?;
+            let key =
+                ArtifactKey::of("features", &[&file.sha256, &options.features, &options.intake.max_long_side_px]).0;
+            let stored = store.get(&key).map_err(|source| io_error(Stage::Features, Path::new(&key), source))?;
+            let stored = stored.and_then(|bytes| feature_file::from_bytes(&bytes, None).ok());
+            let reused = stored.is_some();
+            let count = match stored {
+                Some(features) => Ok(features.len()),
+                None => match extract_one(&folder.join(&file.name), options)? {
+                    Ok(features) => {
+                        let bytes = feature_file::to_bytes(&features);
+                        store.put(&key, &bytes).map_err(|source| io_error(Stage::Features, Path::new(&key), source))?;
+                        Ok(features.len())
+                    }
+                    Err(refusal) => Err(refusal),
+                },
+            };
+            progress.tick();
+            Ok((*id, ImageFeatures { key, count }, reused))
+        })
+        .collect();
+    let extracted: Vec<(ImageId, ImageFeatures, bool)> = extracted.into_iter().collect::<Result<_, _>>()?;
+    let features = extracted.iter().filter_map(|(_, image, _)| image.count.as_ref().ok()).sum();
+    let reused = extracted.iter().filter(|(_, _, reused)| *reused).count();
+    let totals = counts([("images", extracted.len()), ("features", features), ("images_reused", reused)]);
+    Ok((extracted.into_iter().map(|(id, image, _)| (id, image)).collect(), totals))
+}
+
+/// SIFT of one file, in pixels of the original picture.
+fn extract_one(path: &PathBuf, options: &ReconstructionOptions) -> Result<Result<Features, Refusal>, PipelineError> {
+    let bytes = std::fs::read(path).map_err(|source| io_error(Stage::Features, path, source))?;
+    let decoded = Photograph::open(&bytes, &options.intake.limits())
+        .and_then(|photograph| photograph.decode_gray(Some(options.intake.max_long_side_px)));
+    let decoded = match decoded {
+        Ok(decoded) => decoded,
+        Err(error) => return Ok(Err(Refusal { code: error.code().to_owned(), advice: advice(&error) })),
+    };
+    drop(bytes);
+    let mut features = extract(&decoded.image, &options.features);
+    let [scale_x, scale_y] = decoded.to_original;
+    for keypoint in &mut features.keypoints {
+        keypoint.x = (f64::from(keypoint.x) * scale_x) as f32;
+        keypoint.y = (f64::from(keypoint.y) * scale_y) as f32;
+        keypoint.scale = (f64::from(keypoint.scale) * (scale_x * scale_y).sqrt()) as f32;
+    }
+    Ok(Ok(features))
+}
+
+/// Features read back when needed, the most recently used kept up to a budget of bytes.
+pub struct FeatureCache<'a> {
+    store: &'a ArtifactStore,
+    keys: BTreeMap<ImageId, String>,
+    budget_bytes: usize,
+    state: Mutex<CacheState>,
+}
+
+#[derive(Default)]
+struct CacheState {
+    clock: u64,
+    bytes: usize,
+    entries: BTreeMap<ImageId, (u64, Arc<Features>)>,
+    lost: Vec<String>,
+}
+
+/// Bytes one feature takes in memory.
+const FEATURE_BYTES: usize = 144;
+
+impl<'a> FeatureCache<'a> {
+    /// A cache over the stored features of a run.
+    pub fn new(store: &'a ArtifactStore, features: &BTreeMap<ImageId, ImageFeatures>, budget_bytes: usize) -> Self {
+        let usable = features.iter().filter(|(_, image)| image.count.is_ok());
+        Self {
+            store,
+            keys: usable.map(|(&id, image)| (id, image.key.clone())).collect(),
+            budget_bytes,
+            state: Mutex::default(),
+        }
+    }
+
+    /// The features of an image, empty when they can't be read back ([`FeatureCache::check`] then tells).
+    pub fn get(&self, id: ImageId) -> Arc<Features> {
+        if let Some(features) = self.recall(id) {
+            return features;
+        }
+        let features = Arc::new(self.read(id, None));
+        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        state.clock += 1;
+        let now = state.clock;
+        if state.entries.insert(id, (now, features.clone())).is_none() {
+            state.bytes += features.len() * FEATURE_BYTES;
+        }
+        while state.bytes > self.budget_bytes && state.entries.len() > 1 {
+            let Some(oldest) = state.entries.iter().min_by_key(|(_, (used, _))| *used).map(|(&id, _)| id) else {
+                break;
+            };
+            if let Some((_, dropped)) = state.entries.remove(&oldest) {
+                state.bytes -= dropped.len() * FEATURE_BYTES;
+            }
+        }
+        features
+    }
+
+    fn recall(&self, id: ImageId) -> Option<Arc<Features>> {
+        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        state.clock += 1;
+        let now = state.clock;
+        let entry = state.entries.get_mut(&id)?;
+        entry.0 = now;
+        Some(entry.1.clone())
+    }
+
+    /// The `limit` features of largest scale, not kept.
+    pub fn read(&self, id: ImageId, limit: Option<usize>) -> Features {
+        let Some(key) = self.keys.get(&id) else { return Features::default() };
+        let features =
+            self.store.get(key).ok().flatten().and_then(|bytes| feature_file::from_bytes(&bytes, limit).ok());
+        features.unwrap_or_else(|| {
+            let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+            state.lost.push(key.clone());
+            Features::default()
+        })
+    }
+
+    /// Fails when features were lost since they were stored.
+    ///
+    /// # Errors
+    /// Names the first lost file.
+    pub fn check(&self, stage: Stage) -> Result<(), PipelineError> {
+        let state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        match state.lost.first() {
+            None => Ok(()),
+            Some(key) => {
+                let gone = std::io::Error::new(std::io::ErrorKind::NotFound, "stored features are damaged or gone");
+                Err(io_error(stage, Path::new(key), gone))
+            }
+        }
+    }
+}

@@ -1,0 +1,111 @@
+//! The stage `add_cameras`: every photograph without a pose is localised against each model in turn, the largest first.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::coarse::PairMatchCounts;
+use super::features::{FeatureCache, ImageFeatures};
+use super::intake::Intake;
+use super::options::ReconstructionOptions;
+use super::runner::{Counts, StageProgress, counts};
+use super::state::PipelineState;
+use super::{Context, PipelineError, Stage};
+use crate::add_cameras::{LocalizeFailure, QueryImage, add_cameras};
+use crate::camera::Camera;
+use crate::coarse::Unregistered;
+use crate::scene::{CameraId, Features, ImageId};
+
+/// What localisation is given besides the models.
+pub struct Localiser<'a> {
+    /// The photographs.
+    pub intake: &'a Intake,
+    /// Which of them have features.
+    pub found: &'a BTreeMap<ImageId, ImageFeatures>,
+    /// What is known of cameras no model has.
+    pub cameras: &'a BTreeMap<CameraId, Camera>,
+    /// Coarse matches of every pair.
+    pub match_counts: &'a PairMatchCounts,
+    /// The features.
+    pub cache: &'a FeatureCache<'a>,
+    /// All options.
+    pub options: &'a ReconstructionOptions,
+    /// Seed and cancel.
+    pub context: &'a Context,
+}
+
+impl Localiser<'_> {
+    /// Adds every photograph that can be localised.
+    ///
+    /// # Errors
+    /// Cancellation, or features that were lost.
+    pub fn run(
+        &self,
+        mut state: PipelineState,
+        progress: &StageProgress<'_>,
+    ) -> Result<(PipelineState, Counts), PipelineError> {
+        let (mut tried, mut added, mut sightings) = (0, 0, 0);
+        for rank in 0..state.models.len() {
+            let queries = self.queries(&state);
+            tried = tried.max(queries.len());
+            let load = |id: ImageId| -> Arc<Features> { self.cache.get(id) };
+            let told = |done: usize, total: usize| progress.set(done as u64, total as u64);
+            let cancelled = || self.context.cancel.is_cancelled();
+            let model = &mut state.models[rank].model;
+            let (options, seed) = (&self.options.add_cameras, self.context.seed);
+            let outcome = add_cameras(model, &queries, &load, self.match_counts, options, seed, &told, &cancelled);
+            self.cache.check(Stage::AddCameras)?;
+            let account = outcome.map_err(|_| PipelineError::Cancelled)?;
+            added += account.added.len();
+            sightings += account.observations_added;
+            for id in account.added.keys() {
+                state.unregistered.remove(id);
+            }
+            for (id, failure) in account.failed {
+                if let Some(why) = reason(&failure) {
+                    let before = state.unregistered.entry(id).or_insert(Unregistered::NoPairs);
+                    if progress_of(&why) > progress_of(before) {
+                        *before = why;
+                    }
+                }
+            }
+        }
+        Ok((state, counts([("images_tried", tried), ("images_added", added), ("observations_added", sightings)])))
+    }
+
+    /// The photographs that have features and no pose.
+    fn queries(&self, state: &PipelineState) -> Vec<QueryImage> {
+        let located = state.located();
+        let waiting = self.intake.photographs().filter(|(id, _, _)| {
+            !located.contains_key(id)
+                && self.found.get(id).is_some_and(|image| matches!(image.count, Ok(count) if count > 0))
+        });
+        waiting
+            .map(|(image, _, photograph)| QueryImage {
+                image,
+                camera_id: photograph.camera,
+                camera: self.cameras[&photograph.camera].clone(),
+            })
+            .collect()
+    }
+}
+
+/// The verdict a failure amounts to.
+fn reason(failure: &LocalizeFailure) -> Option<Unregistered> {
+    match *failure {
+        LocalizeFailure::NoFeatures | LocalizeFailure::EmptyModel => None,
+        LocalizeFailure::TooFewCorrespondences { found: visible, .. } => Some(Unregistered::TooFewPoints { visible }),
+        LocalizeFailure::TooFewInliers { inliers, correspondences: visible, .. } => {
+            Some(Unregistered::PoseFailed { visible, inliers })
+        }
+    }
+}
+
+/// How far an attempt came: the verdict is that of the one that came farthest. A photograph without any verified pair stays
+/// one that matches nothing, unless a pose nearly worked.
+fn progress_of(why: &Unregistered) -> usize {
+    match *why {
+        Unregistered::TooFewPoints { .. } => 0,
+        Unregistered::NoPairs | Unregistered::NoInitialPair => 1,
+        Unregistered::PoseFailed { inliers, .. } => 1 + inliers,
+    }
+}

@@ -1,0 +1,19 @@
+//! The last adjustment: everything free that the photographs determine, then filtering, a few rounds.
+
+use super::options::ReconstructionOptions;
+use crate::bundle::{self, BundleConfig, FreeIntrinsics};
+use crate::coarse::{filter, free_intrinsics};
+use crate::scene::{Point3dId, Reconstruction};
+
+/// Refines a model in place.
+pub fn refine(model: &mut Reconstruction, options: &ReconstructionOptions) {
+    for _ in 0..options.refine.rounds {
+        let mut config = BundleConfig::global(model, FreeIntrinsics::default());
+        config.intrinsics = free_intrinsics(model, &options.coarse.mapper.intrinsics);
+        bundle::adjust(model, &config, &options.refine.bundle);
+        let all: Vec<Point3dId> = model.points().map(|(id, _)| id).collect();
+        if filter(model, &all, &options.coarse.mapper.keep_limits()) == 0 {
+            break;
+        }
+    }
+}
