@@ -1,3 +1,7 @@
 //! The `multistage` binary.
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    multistage::cli::run()
+}

@@ -1,1 +1,73 @@
 //! The command line: one file per command.
+//!
+//! Exit status: 0 done (for `reconstruct`: a model was made); 1 something outside failed, such as a full disk; 2 bad
+//! arguments or input; 3 the photographs gave no model; 130 interrupted.
+
+mod evaluate;
+mod model_poses;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+#[derive(Debug, Parser)]
+#[command(
+    name = "multistage",
+    version,
+    about = "Photographs of a place or an object to camera poses and a 3D point cloud"
+)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Measure the camera poses of a model against a reference.
+    Evaluate(evaluate::Args),
+}
+
+/// How a command ended otherwise than well.
+#[derive(Debug)]
+enum Failure {
+    /// Bad arguments or input.
+    Input(String),
+    /// Something outside failed.
+    Outside(String),
+}
+
+impl Failure {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Self::Outside(_) => 1,
+            Self::Input(_) => 2,
+        }
+    }
+}
+
+/// Parses the arguments, runs the command, and says how it went.
+pub fn run() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Evaluate(args) => evaluate::run(&args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            match &failure {
+                Failure::Input(message) | Failure::Outside(message) => eprintln!("error: {message}"),
+            }
+            ExitCode::from(failure.exit_code())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_definition_is_consistent() {
+        Cli::command().debug_assert();
+    }
+}

@@ -7,6 +7,7 @@ pub mod exif;
 pub mod features;
 pub mod photograph;
 pub mod ply;
+pub mod poses;
 pub mod report;
 pub mod report_html;
 
