@@ -1,0 +1,55 @@
+//! Gathers features while they are found and keeps those of the largest scales.
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+
+use crate::scene::{Descriptor, Features, Keypoint};
+
+/// Keeps the features of the `limit` largest scales.
+pub(super) struct Collector {
+    limit: usize,
+    /// The largest scales so far, smallest first. Positive floats sort as their bits do.
+    scales: BinaryHeap<Reverse<u32>>,
+    found: Vec<(Keypoint, Descriptor)>,
+}
+
+impl Collector {
+    /// Keeps `limit` features.
+    pub(super) fn new(limit: usize) -> Self {
+        Self { limit, scales: BinaryHeap::new(), found: Vec::new() }
+    }
+
+    /// Whether a feature of this scale could still be among those kept, so that describing it is worth while.
+    pub(super) fn wants(&self, scale: f32) -> bool {
+        self.scales.len() < self.limit || self.scales.peek().is_some_and(|least| scale.to_bits() >= least.0)
+    }
+
+    /// Takes a feature.
+    pub(super) fn push(&mut self, keypoint: Keypoint, descriptor: Descriptor) {
+        self.scales.push(Reverse(keypoint.scale.to_bits()));
+        if self.scales.len() > self.limit {
+            self.scales.pop();
+        }
+        self.found.push((keypoint, descriptor));
+        // Dropping the outgrown ones now and then bounds memory; doubling makes it cheap.
+        if self.found.len() >= 2 * self.limit + 1024 {
+            let least = self.scales.peek().map_or(0, |least| least.0);
+            self.found.retain(|(keypoint, _)| keypoint.scale.to_bits() >= least);
+        }
+    }
+
+    /// The kept features, sorted. Two extrema that were refined to the same place count once.
+    pub(super) fn finish(mut self) -> Features {
+        let order = |a: &Keypoint, b: &Keypoint| {
+            (b.scale.total_cmp(&a.scale))
+                .then(a.y.total_cmp(&b.y))
+                .then(a.x.total_cmp(&b.x))
+                .then(a.orientation.total_cmp(&b.orientation))
+        };
+        self.found.sort_by(|(a, _), (b, _)| order(a, b));
+        self.found.dedup_by(|(a, _), (b, _)| a == b);
+        self.found.truncate(self.limit);
+        let (keypoints, descriptors) = self.found.into_iter().unzip();
+        Features { keypoints, descriptors }
+    }
+}

@@ -1,0 +1,186 @@
+//! One octave of the scale space, streamed from top to bottom.
+//!
+//! With L levels per octave it has L + 3 Gaussian levels of sigma `sigma0 2^(s / L)`, s = 0..L+2; extrema are sought among
+//! the differences s+1 minus s for s = 1..L. Level s+1 is level s blurred by `sigma0 2^(s/L) sqrt(2^(2/L) - 1)`. A level is
+//! a ring of rows; asking for a row of one makes the rows it needs of the levels below. Extrema are sought row by row, and
+//! each is oriented and described at once, for which the rings reach far enough up and down.
+
+use super::blur::{Kernel, Scratch, blur_row};
+use super::collector::Collector;
+use super::descriptor::{self, Describer};
+use super::extrema::{self, Extremum, MAX_ROW_STEPS};
+use super::gradient::Patch;
+use super::options::SiftOptions;
+use super::orientation;
+use super::ring::{Ring, padded};
+use super::simd::Isa;
+use super::source::Source;
+use crate::scene::Keypoint;
+
+/// A whole grey image.
+pub(super) struct Plane {
+    /// Columns.
+    pub(super) width: usize,
+    /// Rows.
+    pub(super) height: usize,
+    /// Row-major values.
+    pub(super) data: Vec<f32>,
+}
+
+impl Plane {
+    /// Row `y`.
+    pub(super) fn row(&self, y: usize) -> &[f32] {
+        &self.data[y * self.width..(y + 1) * self.width]
+    }
+}
+
+/// The Gaussian levels of an octave, as far as their rows are still needed.
+pub(super) struct Levels {
+    /// Columns.
+    pub(super) width: usize,
+    /// Rows.
+    pub(super) height: usize,
+    /// One ring a level.
+    pub(super) rings: Vec<Ring>,
+}
+
+/// An octave at work.
+pub(super) struct Octave<'a> {
+    isa: Isa,
+    options: &'a SiftOptions,
+    index: i32,
+    source: Source<'a>,
+    levels: Levels,
+    /// `kernels[s]` makes level s + 1 from level s.
+    kernels: Vec<Kernel>,
+    scratch: Scratch,
+    /// Rows of each level that must exist below the row in which extrema are sought.
+    lead: Vec<usize>,
+}
+
+impl<'a> Octave<'a> {
+    /// Octave `index` from its first level.
+    pub(super) fn new(isa: Isa, source: Source<'a>, index: i32, options: &'a SiftOptions) -> Self {
+        let per_octave = options.levels_per_octave;
+        let (width, height) = source.size();
+        let kernels: Vec<Kernel> = (0..per_octave + 2)
+            .map(|s| level_sigma(options, s as f32) * (4.0_f32.powf(1.0 / per_octave as f32) - 1.0).sqrt())
+            .map(Kernel::gaussian)
+            .collect();
+        let near = MAX_ROW_STEPS + 2;
+        let reach = |s: usize| {
+            if (1..=per_octave).contains(&s) {
+                near + descriptor::radius_px(level_sigma(options, s as f32 + extrema::MAX_OFFSET)).ceil() as usize
+            } else {
+                near
+            }
+        };
+        let mut lead: Vec<usize> = (0..per_octave + 3).map(reach).collect();
+        for s in (0..kernels.len()).rev() {
+            lead[s] = lead[s].max(lead[s + 1] + kernels[s].radius());
+        }
+        let rings = (0..lead.len())
+            .map(|s| {
+                let kernel_radius = kernels.get(s).map_or(0, Kernel::radius);
+                Ring::new(width, (lead[s] + reach(s).max(kernel_radius) + 2).min(height))
+            })
+            .collect();
+        let radius = kernels.iter().map(Kernel::radius).max().unwrap_or(0).max(source.radius());
+        let scratch = Scratch::new(width, radius);
+        Self { isa, options, index, source, levels: Levels { width, height, rings }, kernels, scratch, lead }
+    }
+
+    /// The largest scale, in original pixels, of a keypoint of octave `index`.
+    pub(super) fn max_scale_px(index: i32, options: &SiftOptions) -> f32 {
+        level_sigma(options, options.levels_per_octave as f32 + extrema::MAX_OFFSET) * 2.0_f32.powi(index)
+    }
+
+    /// Finds and describes the features of the octave and returns the first level of the next.
+    pub(super) fn run(mut self, collector: &mut Collector) -> Plane {
+        let (width, height) = (self.levels.width, self.levels.height);
+        let per_octave = self.options.levels_per_octave;
+        let mut next = Plane { width: width.div_ceil(2), height: height.div_ceil(2), data: Vec::new() };
+        let wants_next = self.index >= 0;
+        if wants_next {
+            next.data.reserve_exact(next.width * next.height);
+        }
+        let mut differences: Vec<Ring> = (0..per_octave + 2).map(|_| Ring::new(width, 3.min(height))).collect();
+        let mut candidates = Vec::new();
+        let mut worker = Worker { describer: Describer::new(), patch: Patch::new() };
+        for y in 0..height {
+            for s in 0..self.levels.rings.len() {
+                self.ensure(s, y + self.lead[s]);
+            }
+            if wants_next && y.is_multiple_of(2) {
+                next.data.extend(self.levels.rings[per_octave].row(y)[..width].iter().step_by(2));
+            }
+            for (s, ring) in differences.iter_mut().enumerate() {
+                extrema::subtract(self.isa, self.levels.rings[s + 1].row(y), self.levels.rings[s].row(y), ring.push());
+            }
+            // Row y completes the neighbourhood of the row above it.
+            if y < 2 {
+                continue;
+            }
+            for s in 1..=per_octave {
+                candidates.clear();
+                extrema::scan_row(self.isa, &differences[s - 1..=s + 1], y - 1, width, self.options, &mut candidates);
+                for &x in &candidates {
+                    if let Some(extremum) = extrema::refine(&self.levels, x, y - 1, s, self.options) {
+                        self.describe(&extremum, &mut worker, collector);
+                    }
+                }
+            }
+        }
+        next
+    }
+
+    /// Makes the rows of level `s` up to row `last` or the last of the image.
+    fn ensure(&mut self, s: usize, last: usize) {
+        let size = (self.levels.width, self.levels.height);
+        let last = last.min(size.1 - 1);
+        while self.levels.rings[s].next() <= last {
+            let y = self.levels.rings[s].next();
+            if s == 0 {
+                let out = self.levels.rings[0].push();
+                self.source.fill(self.isa, y, &mut self.scratch, &mut out[..padded(size.0)]);
+            } else {
+                self.ensure(s - 1, y + self.kernels[s - 1].radius());
+                let (below, above) = self.levels.rings.split_at_mut(s);
+                let out = above[0].push();
+                blur_row(self.isa, &self.kernels[s - 1], &below[s - 1], size, y, &mut self.scratch, out);
+            }
+        }
+    }
+
+    /// Turns an extremum into features.
+    fn describe(&self, extremum: &Extremum, worker: &mut Worker, collector: &mut Collector) {
+        let sigma = level_sigma(self.options, extremum.level);
+        let step = 2.0_f32.powi(self.index);
+        let scale = sigma * step;
+        if !collector.wants(scale) {
+            return;
+        }
+        let ring = &self.levels.rings[extremum.s];
+        let size = (self.levels.width, self.levels.height);
+        // Doubled pixels tile the original ones; from octave 0 on, every second pixel is kept, starting with the first.
+        let offset = if self.index < 0 { 0.5 * step } else { 0.5 };
+        let (at, patch) = ((extremum.x, extremum.y), &mut worker.patch);
+        for orientation in orientation::find(self.isa, ring, size, at, sigma, self.options.max_orientations, patch) {
+            let keypoint =
+                Keypoint { x: extremum.x * step + offset, y: extremum.y * step + offset, scale, orientation };
+            let descriptor = worker.describer.describe(self.isa, ring, size, at, sigma, orientation, patch);
+            collector.push(keypoint, descriptor);
+        }
+    }
+}
+
+/// Buffers used for one keypoint after the other.
+struct Worker {
+    describer: Describer,
+    patch: Patch,
+}
+
+/// Sigma of a (fractional) level in pixels of its octave.
+fn level_sigma(options: &SiftOptions, level: f32) -> f32 {
+    options.sigma0 * 2.0_f32.powf(level / options.levels_per_octave as f32)
+}

@@ -1,0 +1,64 @@
+//! What can be set about feature extraction.
+
+use serde::{Deserialize, Serialize};
+
+/// Options of [`super::extract`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SiftOptions {
+    /// First octave: -1 doubles the image first (more and smaller features, about four times the time), 0 does not.
+    /// Origin: Lowe 2004, section 3.3.
+    pub first_octave: i32,
+    /// Levels per octave in which extrema are sought; more give more, less distinct features. Origin: Lowe 2004, section 3.2.
+    pub levels_per_octave: usize,
+    /// Least absolute difference of Gaussians at a refined extremum, for grey values in [0, 1]; raising it drops features of
+    /// low contrast. Origin: COLMAP's value, 0.02 over the levels per octave.
+    pub peak_threshold: f32,
+    /// Largest ratio of the two principal curvatures; lowering it drops more edge responses. Origin: Lowe 2004, section 4.1.
+    pub edge_threshold: f32,
+    /// Most orientations, hence features, per extremum. Origin: COLMAP.
+    pub max_orientations: usize,
+    /// Most features kept, those of the largest scales. Origin: the paper's images have 9K to 39K; time and matching grow with it.
+    pub max_features: usize,
+    /// Gaussian sigma of the first level of an octave, in its own pixels. Origin: Lowe 2004, section 3.3.
+    pub sigma0: f32,
+    /// Gaussian sigma that the camera's own blur is taken for, in original pixels. Origin: Lowe 2004, section 3.3.
+    pub camera_sigma_px: f32,
+}
+
+impl Default for SiftOptions {
+    fn default() -> Self {
+        Self {
+            first_octave: -1,
+            levels_per_octave: 3,
+            peak_threshold: 0.02 / 3.0,
+            edge_threshold: 10.0,
+            max_orientations: 2,
+            max_features: 16_384,
+            sigma0: 1.6,
+            camera_sigma_px: 0.5,
+        }
+    }
+}
+
+impl SiftOptions {
+    /// Adds a sentence to `errors` for every value out of its range.
+    pub fn validate(&self, errors: &mut Vec<String>) {
+        let mut check = |holds: bool, message: &str| {
+            if !holds {
+                errors.push(message.to_owned());
+            }
+        };
+        check((-1..=0).contains(&self.first_octave), "features.first_octave must be -1 or 0");
+        check((1..=8).contains(&self.levels_per_octave), "features.levels_per_octave must be 1 to 8");
+        check(self.peak_threshold >= 0.0 && self.peak_threshold < 1.0, "features.peak_threshold must be in [0, 1)");
+        check(self.edge_threshold >= 1.0, "features.edge_threshold must be at least 1");
+        check((1..=8).contains(&self.max_orientations), "features.max_orientations must be 1 to 8");
+        check(self.max_features >= 1, "features.max_features must be at least 1");
+        check((0.8..=4.0).contains(&self.sigma0), "features.sigma0 must be 0.8 to 4");
+        check(
+            self.camera_sigma_px >= 0.0 && self.camera_sigma_px <= 0.375 * self.sigma0,
+            "features.camera_sigma_px must be 0 to 0.375 sigma0",
+        );
+    }
+}

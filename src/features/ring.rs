@@ -1,0 +1,45 @@
+//! The most recent rows of an image that is made row by row.
+
+/// Rows are stored in multiples of this many values, so kernels work on whole blocks; values beyond the width mean nothing.
+pub(super) const BLOCK: usize = 32;
+
+/// `length` rounded up to whole blocks.
+pub(super) fn padded(length: usize) -> usize {
+    length.next_multiple_of(BLOCK)
+}
+
+/// The last `capacity` rows of an image.
+pub(super) struct Ring {
+    stride: usize,
+    capacity: usize,
+    next: usize,
+    data: Vec<f32>,
+}
+
+impl Ring {
+    /// An empty ring for rows of `width` values.
+    pub(super) fn new(width: usize, capacity: usize) -> Self {
+        let stride = padded(width);
+        Self { stride, capacity, next: 0, data: vec![0.0; stride * capacity] }
+    }
+
+    /// Number of rows pushed so far, the index of the next.
+    pub(super) fn next(&self) -> usize {
+        self.next
+    }
+
+    /// Row `y` with its padding, which must be among the last `capacity`.
+    #[inline]
+    pub(super) fn row(&self, y: usize) -> &[f32] {
+        debug_assert!(y < self.next && y + self.capacity >= self.next, "row {y} of {} is gone", self.next);
+        let start = (y % self.capacity) * self.stride;
+        &self.data[start..start + self.stride]
+    }
+
+    /// Makes room for the next row and returns it, to be filled.
+    pub(super) fn push(&mut self) -> &mut [f32] {
+        let start = (self.next % self.capacity) * self.stride;
+        self.next += 1;
+        &mut self.data[start..start + self.stride]
+    }
+}
