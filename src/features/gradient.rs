@@ -71,7 +71,7 @@ pub(super) fn direction_of<const FMA: bool>(x: f32, y: f32) -> f32 {
     let (large, small) = if ax > ay { (ax, ay) } else { (ay, ax) };
     let t = small / (large + TINY);
     let q = t * t;
-    let mut p = mul_add::<FMA>(q, 0.002_866_225_7, -0.016_165_737);
+    let mut p = mul_add::<FMA>(q, 0.002_866_225_8, -0.016_165_737);
     p = mul_add::<FMA>(q, p, 0.042_909_614);
     p = mul_add::<FMA>(q, p, -0.075_289_64);
     p = mul_add::<FMA>(q, p, 0.106_562_64);
