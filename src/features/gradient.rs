@@ -75,7 +75,7 @@ pub(super) fn direction_of<const FMA: bool>(x: f32, y: f32) -> f32 {
     p = mul_add::<FMA>(q, p, 0.042_909_614);
     p = mul_add::<FMA>(q, p, -0.075_289_64);
     p = mul_add::<FMA>(q, p, 0.106_562_64);
-    p = mul_add::<FMA>(q, p, -0.142_088_99);
+    p = mul_add::<FMA>(q, p, -0.142_089);
     p = mul_add::<FMA>(q, p, 0.199_935_51);
     p = mul_add::<FMA>(q, p, -0.333_331_45);
     let mut angle = mul_add::<FMA>(t * q, p, t);
