@@ -43,8 +43,14 @@ pub struct TwoViewOptions {
     pub min_threshold_px: f64,
     /// Fewest inliers of a pair. (COLMAP: 15.)
     pub min_inliers: usize,
-    /// When to stop drawing samples.
+    /// Lowest share of the matches that are inliers of a pair: of several hundred wrong matches more than `min_inliers` can
+    /// agree by chance.
+    pub min_inlier_ratio: f64,
+    /// When to stop drawing samples. (At the most trials, samples of five find an inlier ratio of 0.25 with probability 0.98.)
     pub ransac: RansacOptions,
+    /// The most trials for the fundamental matrix of cameras without trusted focal lengths: its samples of seven need more
+    /// trials and each costs a sixth.
+    pub max_uncalibrated_trials: usize,
     /// The essential matrix stands while it has at least this share of the inliers of the fundamental matrix. (COLMAP: 0.95.)
     pub min_essential_ratio: f64,
     /// The pair is planar or panoramic when the homography has at least this share of the inliers of the epipolar matrix.
@@ -64,7 +70,9 @@ impl Default for TwoViewOptions {
             reference_long_side_px: 3200.0,
             min_threshold_px: 1.5,
             min_inliers: 15,
-            ransac: RansacOptions::default(),
+            min_inlier_ratio: 0.1,
+            ransac: RansacOptions { max_trials: 4000, trials_factor: 1.5, ..RansacOptions::default() },
+            max_uncalibrated_trials: 20_000,
             min_essential_ratio: 0.95,
             planar_ratio: 0.8,
             dominant_plane_ratio: 0.4,
@@ -85,6 +93,12 @@ impl TwoViewOptions {
             if !(value > 0.0 && value.is_finite()) {
                 errors.push(format!("{name} must be positive, not {value}"));
             }
+        }
+        if !(0.0..=1.0).contains(&self.min_inlier_ratio) {
+            errors.push(format!("min_inlier_ratio must lie in [0, 1], not {}", self.min_inlier_ratio));
+        }
+        if self.max_uncalibrated_trials < self.ransac.min_trials {
+            errors.push(format!("max_uncalibrated_trials is below min_trials: {}", self.max_uncalibrated_trials));
         }
         for (name, value) in [
             ("min_essential_ratio", self.min_essential_ratio),
@@ -169,21 +183,26 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// Trial limits for a model that is of no use with fewer inliers than `fewest`.
-    fn limits(&self, fewest: f64) -> RansacOptions {
-        let wanted = fewest.max(self.options.min_inliers as f64) / self.pairs.len() as f64;
-        let base = &self.options.ransac;
-        RansacOptions { min_inlier_ratio: wanted.clamp(base.min_inlier_ratio, 1.0), ..base.clone() }
+    /// The fewest inliers of a pair with this many matches.
+    fn min_inliers(&self) -> usize {
+        let share = (self.options.min_inlier_ratio * self.pairs.len() as f64).ceil() as usize;
+        self.options.min_inliers.max(share)
     }
 
+    /// The best model, searched as long as one with `fewest` inliers could be missed; none below the inliers a pair needs.
     fn find<E: Estimator<N>, const N: usize>(
         &self,
         estimator: &E,
         fewest: f64,
+        max_trials: usize,
         rng: &mut Rng,
     ) -> Option<RansacReport<E::Model>> {
-        let report = ransac(estimator, self.threshold, &self.limits(fewest), rng)?;
-        (report.num_inliers >= self.options.min_inliers).then_some(report)
+        let base = &self.options.ransac;
+        let wanted = fewest.max(self.min_inliers() as f64) / self.pairs.len() as f64;
+        let min_inlier_ratio = wanted.clamp(base.min_inlier_ratio, 1.0);
+        let limits = RansacOptions { min_inlier_ratio, max_trials, ..base.clone() };
+        let report = ransac(estimator, self.threshold, &limits, rng)?;
+        (report.num_inliers >= self.min_inliers()).then_some(report)
     }
 
     /// The fundamental matrix of a scene with a dominant plane, when it beats `found`.
@@ -283,13 +302,15 @@ pub fn verify(
     let search = Search { pairs: point_pairs(pixels_a, pixels_b, matches, camera_a, camera_b), threshold, options };
     let calibrated = camera_a.focal_source != FocalSource::Guess && camera_b.focal_source != FocalSource::Guess;
 
-    let by_e = if calibrated { search.find(&EssentialEstimator(&search.pairs), 0.0, rng) } else { None };
+    let max_trials = options.ransac.max_trials;
+    let by_e = if calibrated { search.find(&EssentialEstimator(&search.pairs), 0.0, max_trials, rng) } else { None };
     let num_e = by_e.as_ref().map_or(0, |report| report.num_inliers);
     let to_beat_e = num_e as f64 / options.min_essential_ratio;
-    let by_f = search.find(&FundamentalEstimator(&search.pairs), to_beat_e, rng);
+    let max_f_trials = if calibrated { max_trials } else { options.max_uncalibrated_trials };
+    let by_f = search.find(&FundamentalEstimator(&search.pairs), to_beat_e, max_f_trials, rng);
     let num_f = by_f.as_ref().map_or(0, |report| report.num_inliers);
     let to_be_planar = options.dominant_plane_ratio * num_e.max(num_f) as f64;
-    let by_h = search.find(&HomographyEstimator(&search.pairs), to_be_planar, rng);
+    let by_h = search.find(&HomographyEstimator(&search.pairs), to_be_planar, max_trials, rng);
     let num_h = by_h.as_ref().map_or(0, |report| report.num_inliers);
 
     let essential_stands = by_e.is_some() && num_e as f64 >= options.min_essential_ratio * num_f as f64;
@@ -367,7 +388,7 @@ pub fn verify(
         _ => return None,
     }
     geometry.inliers = matches.iter().zip(&mask).filter(|&(_, &inlier)| inlier).map(|(pair, _)| *pair).collect();
-    (geometry.inliers.len() >= options.min_inliers).then_some(geometry)
+    (geometry.inliers.len() >= search.min_inliers()).then_some(geometry)
 }
 
 impl TwoViewGeometry {

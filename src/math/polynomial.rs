@@ -89,32 +89,50 @@ pub fn determinant<const N: usize, const M: usize, const K: usize>(
 
 /// Newton and bisection steps on a bracket; enough to bisect [-1, 1] down to the last bit.
 const MAX_STEPS: usize = 64;
-/// Steps shorter than this leave a root of magnitude at most 1 exact to rounding.
-const TINY_STEP: f64 = 1e-15;
+/// A Newton step shorter than this is the last one on the polynomial itself: the next would be about its square, which is
+/// below rounding.
+const LAST_STEP: f64 = 1e-9;
+/// The same on its derivatives, whose roots only have to separate those of the next.
+const LAST_STEP_OF_DERIVATIVE: f64 = 1e-4;
 
 /// The root in `[low, high]`, at whose ends `p` has opposite signs; `rising` says that it is negative at `low`.
-fn bracketed_root(coefficients: &[f64], mut low: f64, mut high: f64, rising: bool) -> f64 {
+#[inline]
+fn bracketed_root(coefficients: &[f64], mut low: f64, mut high: f64, rising: bool, last_step: f64) -> f64 {
     let mut x = 0.5 * (low + high);
     for _ in 0..MAX_STEPS {
         let (value, slope) = evaluate_with_slope(coefficients, x);
-        if value == 0.0 {
-            return x;
+        let newton = value / slope;
+        if newton.abs() < last_step {
+            return (x - newton).clamp(low, high);
         }
         if (value < 0.0) == rising {
             low = x;
         } else {
             high = x;
         }
-        let newton = x - value / slope;
-        let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
-        let step = (next - x).abs();
-        x = next;
-        if step < TINY_STEP {
-            break;
-        }
+        let next = x - newton;
+        x = if next > low && next < high { next } else { 0.5 * (low + high) };
     }
     x
 }
+
+/// The most coefficients a polynomial may have.
+const MAX_COEFFICIENTS: usize = 16;
+/// Binomial coefficients: `BINOMIALS[n][k]` is n over k.
+const BINOMIALS: [[f64; MAX_COEFFICIENTS]; MAX_COEFFICIENTS] = {
+    let mut table = [[0.0; MAX_COEFFICIENTS]; MAX_COEFFICIENTS];
+    let mut n = 0;
+    while n < MAX_COEFFICIENTS {
+        table[n][0] = 1.0;
+        let mut k = 1;
+        while k <= n {
+            table[n][k] = table[n - 1][k - 1] + table[n - 1][k];
+            k += 1;
+        }
+        n += 1;
+    }
+    table
+};
 
 /// The roots of odd multiplicity in [-1, 1], ascending.
 fn roots_in_unit_interval<const N: usize>(coefficients: &[f64; N]) -> Roots<N> {
@@ -124,11 +142,7 @@ fn roots_in_unit_interval<const N: usize>(coefficients: &[f64; N]) -> Roots<N> {
         let order = N - 1 - degree;
         let mut derivative = [0.0; N];
         for (k, slot) in derivative[..=degree].iter_mut().enumerate() {
-            let mut binomial = 1.0;
-            for i in 0..order {
-                binomial *= (k + order - i) as f64 / (i + 1) as f64;
-            }
-            *slot = coefficients[k + order] * binomial;
+            *slot = coefficients[k + order] * BINOMIALS[k + order][order];
         }
         let derivative = &derivative[..=degree];
         let mut next = Roots::<N>::new();
@@ -138,7 +152,8 @@ fn roots_in_unit_interval<const N: usize>(coefficients: &[f64; N]) -> Roots<N> {
             let right = if i < roots.len { roots.values[i] } else { 1.0 };
             let at_right = evaluate(derivative, right);
             if (at_left < 0.0) != (at_right < 0.0) {
-                next.push(bracketed_root(derivative, left, right, at_left < 0.0));
+                let last_step = if order == 0 { LAST_STEP } else { LAST_STEP_OF_DERIVATIVE };
+                next.push(bracketed_root(derivative, left, right, at_left < 0.0, last_step));
             }
             (left, at_left) = (right, at_right);
         }
@@ -149,6 +164,7 @@ fn roots_in_unit_interval<const N: usize>(coefficients: &[f64; N]) -> Roots<N> {
 
 /// The real roots of odd multiplicity of a polynomial of degree at most `N - 1`, in no particular order.
 pub fn real_roots<const N: usize>(coefficients: &[f64; N]) -> Roots<N> {
+    const { assert!(N <= MAX_COEFFICIENTS) };
     let largest = coefficients.iter().fold(0.0f64, |largest, c| largest.max(c.abs()));
     if largest == 0.0 || !largest.is_finite() {
         return Roots::new();
