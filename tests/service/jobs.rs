@@ -134,7 +134,7 @@ async fn failures_say_where_and_why() {
 async fn what_can_not_be_a_job_is_refused_and_leaves_nothing() {
     let service = Service::start().await;
     let post = async |form| service.post_form("/api/v1/jobs", form).await;
-    post(photographs([])).await.assert_problem(422, "no_images");
+    post(photographs([]).text("name", "nothing")).await.assert_problem(422, "no_images");
     post(photographs(["readme.txt"])).await.assert_problem(422, "no_images");
     let long = "x".repeat(201);
     post(photographs(["a.jpg"]).text("name", long)).await.assert_problem(422, "invalid_name");
