@@ -1,5 +1,7 @@
 //! The HTTP interface, request by request, on a real listener with a quick engine. One binary, one file per resource.
 
+#![allow(clippy::unwrap_used)]
+
 mod service;
 
 #[path = "service/datasets.rs"]

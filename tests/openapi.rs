@@ -1,5 +1,7 @@
 //! Holds the router to `openapi.yaml`, in both directions. (The tests of the service hold every single answer to it.)
 
+#![allow(clippy::unwrap_used)]
+
 mod service;
 
 use std::collections::BTreeSet;

@@ -5,6 +5,7 @@
 
 mod evaluate;
 mod model_poses;
+mod serve;
 
 use std::process::ExitCode;
 
@@ -25,6 +26,8 @@ struct Cli {
 enum Command {
     /// Measure the camera poses of a model against a reference.
     Evaluate(evaluate::Args),
+    /// Run the web service, with its page.
+    Serve(serve::Args),
 }
 
 /// How a command ended otherwise than well.
@@ -49,6 +52,7 @@ impl Failure {
 pub fn run() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Serve(args) => serve::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

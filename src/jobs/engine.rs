@@ -1,20 +1,9 @@
 //! What the executor runs: the pipeline in the service, something quick in tests.
 
-use std::path::PathBuf;
+use serde::Deserialize;
 
 use crate::formats::report::Report;
-use crate::pipeline::{Context, PipelineError};
-
-/// The folders of a run.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct RunPaths {
-    /// Photographs; read only.
-    pub images_dir: PathBuf,
-    /// Takes the outputs; empty at the start.
-    pub out_dir: PathBuf,
-    /// Keeps what an interrupted run goes on from.
-    pub work_dir: PathBuf,
-}
+use crate::pipeline::{Context, PipelineError, ReconstructionOptions, RunPaths, reconstruct};
 
 /// Makes models out of photographs. Called from a thread of the job's own; may take hours and may panic.
 pub trait Engine: Send + Sync + 'static {
@@ -29,4 +18,29 @@ pub trait Engine: Send + Sync + 'static {
     /// # Errors
     /// Why there is no report.
     fn run(&self, paths: &RunPaths, options: &serde_json::Value, context: &Context) -> Result<Report, PipelineError>;
+}
+
+/// The pipeline.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct PipelineEngine;
+
+fn parse(options: &serde_json::Value) -> Result<ReconstructionOptions, PipelineError> {
+    let options = ReconstructionOptions::deserialize(options)
+        .map_err(|error| PipelineError::InvalidOptions(vec![error.to_string()]))?;
+    options.validate()?;
+    Ok(options)
+}
+
+impl Engine for PipelineEngine {
+    fn validate(&self, options: &serde_json::Value) -> Result<(), Vec<String>> {
+        match parse(options) {
+            Ok(_) => Ok(()),
+            Err(PipelineError::InvalidOptions(errors)) => Err(errors),
+            Err(error) => Err(vec![error.to_string()]),
+        }
+    }
+
+    fn run(&self, paths: &RunPaths, options: &serde_json::Value, context: &Context) -> Result<Report, PipelineError> {
+        reconstruct(paths, &parse(options)?, context)
+    }
 }

@@ -14,7 +14,7 @@ mod recovery;
 mod state;
 pub mod view;
 
-pub use engine::{Engine, RunPaths};
+pub use engine::{Engine, PipelineEngine};
 pub use eta::{Eta, estimate};
 pub use executor::{Executor, Tick};
 pub use hub::Hub;

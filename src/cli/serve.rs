@@ -1,0 +1,109 @@
+//! `multistage serve`: the web service, until a signal stops it.
+
+use std::io::Write;
+use std::net::SocketAddr;
+use std::num::{NonZeroU64, NonZeroUsize};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::ValueEnum;
+use tokio::signal::unix::{SignalKind, signal};
+use tracing_subscriber::EnvFilter;
+
+use super::Failure;
+use crate::config::ServerConfig;
+use crate::http::Server;
+use crate::jobs::PipelineEngine;
+
+/// Arguments of `multistage serve`.
+#[derive(Debug, clap::Args)]
+pub(super) struct Args {
+    /// Address to listen on; port 0 takes a free one. Keep it on this machine unless something in front checks who may come in.
+    #[arg(long, env = "MULTISTAGE_BIND", default_value = "127.0.0.1:8080")]
+    bind: SocketAddr,
+    /// Directory that keeps photographs, jobs and models; one process at a time may use it.
+    #[arg(long, env = "MULTISTAGE_DATA_DIR", default_value = "./multistage-data")]
+    data_dir: PathBuf,
+    /// Worker threads of a job [default: all of the machine's].
+    #[arg(long, env = "MULTISTAGE_THREADS")]
+    threads: Option<NonZeroUsize>,
+    /// Jobs that run at once; each has its own threads and memory.
+    #[arg(long, env = "MULTISTAGE_MAX_PARALLEL_JOBS", default_value = "1")]
+    max_parallel_jobs: NonZeroUsize,
+    /// Bytes that one upload may bring [default: 256 GiB].
+    #[arg(long, env = "MULTISTAGE_MAX_UPLOAD_BYTES")]
+    max_upload_bytes: Option<NonZeroU64>,
+    /// Photographs that one upload may bring [default: 100000].
+    #[arg(long, env = "MULTISTAGE_MAX_FILES")]
+    max_files: Option<NonZeroUsize>,
+    /// Seed of every job's random choices.
+    #[arg(long, default_value = "0")]
+    seed: u64,
+    /// How the log on standard error is written; RUST_LOG chooses what.
+    #[arg(long, env = "MULTISTAGE_LOG_FORMAT", value_enum, default_value = "text")]
+    log_format: LogFormat,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum LogFormat {
+    /// One line for people.
+    Text,
+    /// One JSON object a line.
+    Json,
+}
+
+impl Args {
+    fn config(&self) -> ServerConfig {
+        let mut config = ServerConfig::new(&self.data_dir);
+        config.bind = self.bind;
+        config.threads = self.threads.map_or(config.threads, NonZeroUsize::get);
+        config.parallel_jobs = self.max_parallel_jobs.get();
+        config.seed = self.seed;
+        let uploads = &mut config.uploads;
+        uploads.max_upload_bytes = self.max_upload_bytes.map_or(uploads.max_upload_bytes, NonZeroU64::get);
+        uploads.archive.max_total_bytes = uploads.max_upload_bytes;
+        uploads.max_files = self.max_files.map_or(uploads.max_files, NonZeroUsize::get);
+        config
+    }
+}
+
+/// Runs the service.
+pub(super) fn run(args: &Args) -> Result<(), Failure> {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn"));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match args.log_format {
+        LogFormat::Text => log.init(),
+        LogFormat::Json => log.json().init(),
+    }
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::Outside(format!("can't start the runtime: {error}")))?;
+    let served = runtime.block_on(serve(args.config()));
+    // A job that did not stop in time ends with the process and goes on after the next start.
+    runtime.shutdown_timeout(Duration::from_secs(1));
+    served
+}
+
+async fn serve(config: ServerConfig) -> Result<(), Failure> {
+    let outside = |error: std::io::Error| Failure::Outside(error.to_string());
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(outside)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(outside)?;
+    let server =
+        Server::start(config, Arc::new(PipelineEngine)).await.map_err(|error| Failure::Outside(error.to_string()))?;
+    // For whoever started it and waits for the port.
+    println!("listening on http://{}/", server.address);
+    std::io::stdout().flush().map_err(outside)?;
+    tokio::select! {
+        _ = interrupt.recv() => {}
+        _ = terminate.recv() => {}
+    }
+    tracing::info!("stopping; a second signal stops at once");
+    tokio::select! {
+        () = server.stop() => {}
+        _ = interrupt.recv() => {}
+        _ = terminate.recv() => {}
+    }
+    Ok(())
+}
