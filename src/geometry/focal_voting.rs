@@ -97,10 +97,12 @@ pub struct FocalGroup {
 /// What a group's pairs say.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FocalEstimate {
-    /// The focal length in pixels; the one given where the group is fixed or no pair speaks.
+    /// The focal length in pixels; the one given where the group is fixed, no pair speaks, or the votes only rise towards the
+    /// border of the candidates.
     pub focal_px: f64,
     /// From 0 to 1: how far the votes for it rise above those for focal lengths elsewhere, relative to the most that the pairs
-    /// could give. Above about 0.2 the estimate can be relied on; degenerate motions stay below 0.05.
+    /// could give. On synthetic pairs with a pixel of noise it is above 0.4 and the focal length right to 1 % (3 % for three
+    /// pairs); optical axes that all meet give 0.
     pub confidence: f64,
     /// Number of pairs that voted.
     pub num_pairs: usize,
@@ -244,21 +246,18 @@ fn tally(
         possible += vote.weight;
     }
     let best = (0..n).fold(0, |best, k| if score[k] > score[best] { k } else { best });
-    // A parabola through the peak and its neighbours.
-    let mut at = best as f64;
-    if best > 0 && best + 1 < n {
-        let (left, top, right) = (score[best - 1], score[best], score[best + 1]);
-        let bend = left - 2.0 * top + right;
-        if bend < 0.0 {
-            at += (0.5 * (left - right) / bend).clamp(-0.5, 0.5);
-        }
+    // A peak at the border is no peak: the votes rise beyond it.
+    if best == 0 || best + 1 == n || possible <= 0.0 {
+        return FocalEstimate { focal_px: group.focal_px, confidence: 0.0, num_pairs: heard.len() };
     }
+    // A parabola through the peak and its neighbours.
+    let (left, top, right) = (score[best - 1], score[best], score[best + 1]);
+    let bend = left - 2.0 * top + right;
+    let offset = if bend < 0.0 { (0.5 * (left - right) / bend).clamp(-0.5, 0.5) } else { 0.0 };
     let reach = (PEAK_WIDTH.ln() / step).ceil() as usize;
     let rival = (0..n).filter(|&k| k.abs_diff(best) > reach).map(|k| score[k]).fold(f64::NEG_INFINITY, f64::max);
-    // A peak at the border is no peak: the votes rise beyond it.
-    let inside = best > 0 && best + 1 < n;
-    let confidence = if inside && possible > 0.0 { ((score[best] - rival) / possible).clamp(0.0, 1.0) } else { 0.0 };
-    FocalEstimate { focal_px: candidate_px(at), confidence, num_pairs: heard.len() }
+    let confidence = ((score[best] - rival) / possible).clamp(0.0, 1.0);
+    FocalEstimate { focal_px: candidate_px(best as f64 + offset), confidence, num_pairs: heard.len() }
 }
 
 #[cfg(test)]
