@@ -68,7 +68,7 @@ impl Default for TwoViewOptions {
         Self {
             threshold_px: 4.0,
             reference_long_side_px: 3200.0,
-            min_threshold_px: 1.5,
+            min_threshold_px: 2.0,
             min_inliers: 15,
             min_inlier_ratio: 0.1,
             ransac: RansacOptions { max_trials: 4000, trials_factor: 1.5, ..RansacOptions::default() },
