@@ -1,8 +1,7 @@
 //! Decoded pixels to 8-bit grey or colour, and reduction in size.
 
-use fast_image_resize::images::{Image, ImageRef};
-use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
-use image::DynamicImage;
+use image::imageops::{self, FilterType};
+use image::{DynamicImage, ImageBuffer, Luma, Pixel, Rgb};
 
 use super::Decoded;
 use crate::scene::{GrayImage, RgbImage};
@@ -67,7 +66,10 @@ pub(super) fn to_rgb(image: &DynamicImage) -> RgbImage {
 /// Reduces the longer side to `max_long_side`, where it is longer.
 pub(super) fn shrink_gray(image: GrayImage, max_long_side: Option<u32>) -> Decoded<GrayImage> {
     let GrayImage { width, height, data } = image;
-    let (data, (new_width, new_height)) = shrink(data, (width, height), PixelType::U8, max_long_side);
+    let Some((new_width, new_height)) = reduced_size(width, height, max_long_side) else {
+        return Decoded { image: GrayImage::new(width, height, data), to_original: [1.0, 1.0] };
+    };
+    let data = resize::<Luma<u8>>(data, (width, height), (new_width, new_height));
     Decoded {
         image: GrayImage::new(new_width, new_height, data),
         to_original: [width as f64 / new_width as f64, height as f64 / new_height as f64],
@@ -77,32 +79,28 @@ pub(super) fn shrink_gray(image: GrayImage, max_long_side: Option<u32>) -> Decod
 /// Reduces the longer side to `max_long_side`, where it is longer.
 pub fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbImage> {
     let RgbImage { width, height, data } = image;
-    let (data, (new_width, new_height)) = shrink(data, (width, height), PixelType::U8x3, max_long_side);
+    let Some((new_width, new_height)) = reduced_size(width, height, max_long_side) else {
+        return Decoded { image: RgbImage::new(width, height, data), to_original: [1.0, 1.0] };
+    };
+    let data = resize::<Rgb<u8>>(data, (width, height), (new_width, new_height));
     Decoded {
         image: RgbImage::new(new_width, new_height, data),
         to_original: [width as f64 / new_width as f64, height as f64 / new_height as f64],
     }
 }
 
-/// The Lanczos filter of fast_image_resize widens with the reduction, so it neither aliases nor shifts: the corner of the
-/// first pixel stays at (0, 0).
-fn shrink(
-    data: Vec<u8>,
-    (width, height): (usize, usize),
-    pixel_type: PixelType,
-    max_long_side: Option<u32>,
-) -> (Vec<u8>, (usize, usize)) {
+/// The size with the longer side at `max_long_side`; none when it is no longer already.
+fn reduced_size(width: usize, height: usize, max_long_side: Option<u32>) -> Option<(usize, usize)> {
     let longer = width.max(height);
-    let target = max_long_side.map_or(longer, |side| (side as usize).max(1));
-    if longer <= target {
-        return (data, (width, height));
-    }
+    let target = (max_long_side? as usize).max(1);
     let scaled = |side: usize| ((side * target + longer / 2) / longer).max(1);
-    let (new_width, new_height) = (scaled(width), scaled(height));
-    let source = ImageRef::new(width as u32, height as u32, &data, pixel_type)
+    (longer > target).then(|| (scaled(width), scaled(height)))
+}
+
+/// The Catmull-Rom filter of the image crate widens with the reduction, so it neither aliases nor shifts: the corner of the
+/// first pixel stays at (0, 0).
+fn resize<P: Pixel<Subpixel = u8> + 'static>(data: Vec<u8>, from: (usize, usize), to: (usize, usize)) -> Vec<u8> {
+    let source: ImageBuffer<P, Vec<u8>> = ImageBuffer::from_raw(from.0 as u32, from.1 as u32, data)
         .expect("the raster's length was checked when it was made");
-    let mut reduced = Image::new(new_width as u32, new_height as u32, pixel_type);
-    let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Lanczos3));
-    Resizer::new().resize(&source, &mut reduced, &options).expect("both rasters are of one pixel type");
-    (reduced.into_vec(), (new_width, new_height))
+    imageops::resize(&source, to.0 as u32, to.1 as u32, FilterType::CatmullRom).into_raw()
 }
