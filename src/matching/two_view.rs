@@ -206,7 +206,7 @@ impl Search<'_> {
     }
 
     /// The fundamental matrix of a scene with a dominant plane, when it beats `found`.
-    fn from_dominant_plane(
+    fn beyond_dominant_plane(
         &self,
         found: &RansacReport<Matrix3<f64>>,
         plane: &RansacReport<HomographyModel>,
@@ -378,7 +378,7 @@ pub fn verify(
             }
         }
         (_, Some(f), by_h) => {
-            let better = by_h.as_ref().and_then(|plane| search.from_dominant_plane(&f, plane, rng));
+            let better = by_h.as_ref().and_then(|plane| search.beyond_dominant_plane(&f, plane, rng));
             let f = better.unwrap_or(f);
             geometry.config = TwoViewConfig::Uncalibrated;
             geometry.num_f_inliers = f.num_inliers;
