@@ -6,12 +6,14 @@
     python benches/sift/compare_opencv.py PHOTO... [--binary target/release/examples/sift_extract] [--features 4000]
 
 Every photograph is reduced to at most --side pixels, then turned, scaled, tilted, brightened, blurred and made noisy by a
-known homography. Each extractor gives its best --features keypoints of both pictures: OpenCV those of the strongest
-response (its own choice) or, with --by-scale, of the largest scale; ours and COLMAP's those of the largest scale.
-OpenCV's descriptors are turned into RootSIFT, too. Printed per warp, summed over the photographs:
+known homography. All extractors have the same threshold of contrast (0.02 / 3) and give the same number of keypoints of
+a picture: as many as ours finds, at most --features (0: no limit). Of more, OpenCV gives those of the strongest response
+(its own choice) or, with --by-scale, of the largest scale; ours and COLMAP's are those of the largest scale. OpenCV's
+descriptors are turned into RootSIFT, too. Printed per warp, summed over the photographs:
 
     repeatability   keypoints of the first picture with one of the second within --tolerance pixels and a scale ratio
                     below 1.3, over the smaller number of keypoints in the common area, in per cent
+    features        keypoints of the second picture
     correct         mutual nearest neighbours that pass the ratio test (0.8) and agree with the homography (3 px)
     wrong           those that pass and do not agree
     error           median distance of the correct ones, pixels
@@ -27,11 +29,11 @@ import cv2
 import numpy as np
 
 
-def ours(image, args):
+def ours(image, args, _):
     with tempfile.TemporaryDirectory() as folder:
         source, out = pathlib.Path(folder, "image.png"), pathlib.Path(folder, "features")
         cv2.imwrite(str(source), image)
-        command = [args.binary, source, out, "--max", str(args.features)]
+        command = [args.binary, source, out, "--max", str(args.features or 10**6)]
         seconds = float(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()[0])
         data = out.read_bytes()
     count = int(np.frombuffer(data, "<u4", 1)[0])
@@ -40,8 +42,8 @@ def ours(image, args):
     return keypoints.astype(np.float32), descriptors.astype(np.float32), seconds
 
 
-def opencv(image, args):
-    sift = cv2.SIFT_create(nfeatures=0 if args.by_scale else args.features, enable_precise_upscale=True)
+def opencv(image, args, count):
+    sift = cv2.SIFT_create(nfeatures=0 if args.by_scale else count, contrastThreshold=0.02, enable_precise_upscale=True)
     start = time.process_time()
     found, descriptors = sift.detectAndCompute(image, None)
     seconds = time.process_time() - start
@@ -49,23 +51,23 @@ def opencv(image, args):
     keypoints = np.array([(*k.pt, k.size / 2, np.radians(k.angle)) for k in found], np.float32)
     keypoints[:, :2] += 0.5
     order = np.argsort(-keypoints[:, 2], kind="stable") if args.by_scale else np.arange(len(keypoints))
-    order = order[: args.features]
+    order = order[:count]
     return keypoints[order], rooted(descriptors[order]), seconds
 
 
-def colmap(image, args):
+def colmap(image, args, count):
     import pycolmap
 
     options = pycolmap.SiftExtractionOptions()
-    options.max_num_features = args.features
+    options.max_num_features = count
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
     extraction.sift = options
     start = time.process_time()
     keypoints, descriptors = pycolmap.Sift(extraction, device=pycolmap.Device.cpu).extract(image)
     seconds = time.process_time() - start
-    order = np.argsort(-keypoints[:, 2], kind="stable")[: args.features]
-    return np.asarray(keypoints, np.float32)[order], np.asarray(descriptors, np.float32)[order] , seconds
+    order = np.argsort(-keypoints[:, 2], kind="stable")[:count]
+    return np.asarray(keypoints, np.float32)[order], np.asarray(descriptors, np.float32)[order], seconds
 
 
 def rooted(descriptors):
@@ -73,7 +75,7 @@ def rooted(descriptors):
 
 
 def warps(height, width):
-    """Name, homography (pixels, first centre at 0.5), size of the result, change of the grey values."""
+    """Each warp: name, homography (pixels, first centre at 0.5), size of the result, change of the grey values."""
     rng = np.random.default_rng(1)
 
     def similarity(degrees, scale):
@@ -114,6 +116,15 @@ def warp(image, homography, size, change):
     matrix = np.linalg.inv(half) @ homography @ half
     image = cv2.warpPerspective(image, matrix, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.clip(np.rint(change(np.clip(image, 0, 255))), 0, 255).astype(np.uint8)
+
+
+def extract_all(image, args, extractors):
+    """The features of every extractor, ours first: it sets the number."""
+    results, count = {}, 0
+    for name, extract in extractors.items():
+        results[name] = extract(image, args, count)
+        count = count or len(results[name][0])
+    return results
 
 
 def transfer(homography, points):
@@ -168,7 +179,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", nargs="+")
     parser.add_argument("--binary", default="target/release/examples/sift_extract")
-    parser.add_argument("--features", type=int, default=4000)
+    parser.add_argument("--features", type=int, default=0)
     parser.add_argument("--side", type=int, default=1200)
     parser.add_argument("--tolerance", type=float, default=1.5)
     parser.add_argument("--by-scale", action="store_true", help="OpenCV's features of the largest scale, too")
@@ -183,33 +194,32 @@ def main():
             image = cv2.resize(image, None, fx=args.side / max(image.shape), fy=args.side / max(image.shape),
                                interpolation=cv2.INTER_AREA)
         sizes = image.shape[::-1]
-        base = {name: extract(image, args) for name, extract in extractors.items()}
+        base = extract_all(image, args, extractors)
         for warp_name, homography, size, change in warps(*image.shape):
             picture = warp(image, homography, size, change)
-            for name, extract in extractors.items():
-                other = extract(picture, args)
+            for name, other in extract_all(picture, args, extractors).items():
                 seconds[name] += other[2]
                 found, possible = repeatability(base[name][0], other[0], homography, (sizes, size), args.tolerance)
                 off, wrong = matching(base[name][:2], other[:2], homography)
-                total = totals.setdefault((warp_name, name), [0, 0, 0, 0, []])
+                total = totals.setdefault((warp_name, name), [0, 0, 0, 0, [], 0])
                 for i, value in enumerate((found, possible, len(off), wrong)):
                     total[i] += value
                 total[4].append(off)
+                total[5] += len(other[0])
     names = list(extractors)
-    print(f"{'':12}" + "".join(f"| {name:^35}" for name in names))
-    print(f"{'warp':12}" + "".join(f"| {'repeat %':>9}{'correct':>9}{'wrong':>8}{'error px':>9}" for _ in names))
+    print(f"{'':12}" + "".join(f"| {name:^42}" for name in names))
+    print(f"{'warp':12}" + "".join(f"| {'features':>8}{'repeat %':>9}{'correct':>9}{'wrong':>7}{'error px':>9}" for _ in names))
+
+    def cells(rows):
+        found, possible, correct, wrong = (sum(row[i] for row in rows) for i in range(4))
+        error = np.median(np.concatenate([off for row in rows for off in row[4]]))
+        features = sum(row[5] for row in rows)
+        return f"| {features:8}{100 * found / max(possible, 1):9.1f}{correct:9}{wrong:7}{error:9.3f}"
+
     for warp_name in dict.fromkeys(key[0] for key in totals):
-        line = f"{warp_name:12}"
-        for name in names:
-            found, possible, correct, wrong, off = totals[warp_name, name]
-            line += f"| {100 * found / max(possible, 1):9.1f}{correct:9}{wrong:8}{np.median(np.concatenate(off)):9.3f}"
-        print(line)
-    print(f"{'sum':12}" + "".join(
-        "| {:9.1f}{:9}{:8}{:9}".format(
-            100 * sum(totals[k][0] for k in totals if k[1] == name) / sum(totals[k][1] for k in totals if k[1] == name),
-            sum(totals[k][2] for k in totals if k[1] == name), sum(totals[k][3] for k in totals if k[1] == name), "")
-        for name in names))
-    print("CPU s       " + "".join(f"| {seconds[name]:35.2f}" for name in names))
+        print(f"{warp_name:12}" + "".join(cells([totals[warp_name, name]]) for name in names))
+    print(f"{'all warps':12}" + "".join(cells([totals[key] for key in totals if key[1] == name]) for name in names))
+    print("CPU s       " + "".join(f"| {seconds[name]:42.2f}" for name in names))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@
 
 use std::f32::consts::{SQRT_2, TAU};
 
-use super::gradient::Patch;
+use super::gradient::{LANES, Patch};
 use super::orientation::clip;
 use super::ring::Ring;
 use super::simd::{Isa, mul_add, stamp};
@@ -29,6 +29,10 @@ const BIN_SIGMAS: f32 = 3.0;
 const REACH: f32 = 0.5 * (SIDE as f32 + 1.0);
 /// The Gaussian weight is exp(-(u^2 + v^2) / this): its sigma is half the descriptor's width.
 const FALLOFF: f32 = 0.5 * (SIDE * SIDE) as f32;
+/// The last place in bins, counted from the rim's first bin, that shares with an existing bin.
+const MAX_PLACE: f32 = SIDE as f32 + 0.999;
+/// The last cell with neighbours to the right and below.
+const MAX_CELL: usize = SIDE * RIMMED + SIDE;
 /// Largest value, relative to the Euclidean norm.
 const CLIP: f32 = 0.2;
 /// Quantisation of the square roots.
@@ -79,6 +83,9 @@ impl Describer {
         let (du, dv) = (cos / bin, -sin / bin);
         let radius = REACH * bin * (sin.abs() + cos.abs());
         let (top, bottom) = clip(y, radius, height);
+        let (from, to) = clip(x, radius, width);
+        let falloff = -1.0 / (FALLOFF * bin * bin);
+        patch.set_window(x, falloff, from, to);
         for row in top..bottom {
             let dy = row as f32 - y;
             let (u, v) = (sin * dy / bin, cos * dy / bin);
@@ -89,14 +96,15 @@ impl Describer {
                 continue;
             }
             let (left, right) = clip(x + 0.5 * (low + high), 0.5 * (high - low), width);
+            let (left, right) = (left.max(from), right.min(to));
             if left >= right {
                 continue;
             }
-            patch.fill(isa, ring, row, left, right);
+            patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
             let dx = left as f32 - x;
             let stretch = Stretch { u: u + du * dx, v: v + dv * dx, du, dv, theta };
             let count = right - left;
-            accumulate(isa, &stretch, &patch.magnitude[..count], &patch.direction[..count], &mut self.cells);
+            accumulate(isa, &stretch, &patch.weight[..count], &patch.direction[..count], &mut self.cells);
         }
         quantise(&self.cells)
     }
@@ -113,41 +121,52 @@ fn inside(at: f32, slope: f32) -> (f32, f32) {
 }
 
 stamp!(
-    /// Adds a stretch of gradients to the cells.
-    accumulate => accumulate_body(stretch: &Stretch, magnitude: &[f32], direction: &[f32], cells: &mut Cells)
+    /// Adds a stretch of weighted gradients to the cells.
+    accumulate => accumulate_body(stretch: &Stretch, weight: &[f32], direction: &[f32], cells: &mut Cells)
 );
 
 #[inline(always)]
-fn accumulate_body<const FMA: bool>(stretch: &Stretch, magnitude: &[f32], direction: &[f32], cells: &mut Cells) {
-    /// The first value within the rim: coordinate -REACH falls there.
-    const ORIGIN: f32 = REACH;
-    for (i, (&magnitude, &direction)) in magnitude.iter().zip(direction).enumerate() {
-        let u = mul_add::<FMA>(stretch.du, i as f32, stretch.u);
-        let v = mul_add::<FMA>(stretch.dv, i as f32, stretch.v);
-        let weight = magnitude * (-(u * u + v * v) / FALLOFF).exp();
-        let (column, row) = ((u + ORIGIN).max(0.0), (v + ORIGIN).max(0.0));
-        let (c, r) = ((column as usize).min(SIDE), (row as usize).min(SIDE));
-        let (pc, pr) = (column - c as f32, row - r as f32);
-        // Shares of the eight directions: 1 - distance in bins, around the circle.
-        let turn = (direction - stretch.theta) * (DIRECTIONS as f32 / TAU);
-        let turn = if turn < 0.0 { turn + DIRECTIONS as f32 } else { turn };
-        let mut shares = [0.0_f32; DIRECTIONS];
-        for (k, share) in shares.iter_mut().enumerate() {
-            let away = (turn - k as f32).abs();
-            let away = if away > 0.5 * DIRECTIONS as f32 { DIRECTIONS as f32 - away } else { away };
-            *share = if away < 1.0 { weight * (1.0 - away) } else { 0.0 };
+fn accumulate_body<const FMA: bool>(stretch: &Stretch, weight: &[f32], direction: &[f32], cells: &mut Cells) {
+    const TURN: f32 = DIRECTIONS as f32;
+    let mut first_u = stretch.u + REACH;
+    let mut first_v = stretch.v + REACH;
+    let shift = stretch.theta * (TURN / TAU);
+    for (weights, directions) in weight.chunks(LANES).zip(direction.chunks(LANES)) {
+        // What each pixel adds to where, for a block of pixels at once ...
+        let (mut part_u, mut part_v, mut turn) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+        let mut cell = [0_u32; LANES];
+        for i in 0..LANES {
+            // Rounding may take a pixel of the rim a hair outside.
+            let u = mul_add::<FMA>(stretch.du, i as f32, first_u).clamp(0.0, MAX_PLACE);
+            let v = mul_add::<FMA>(stretch.dv, i as f32, first_v).clamp(0.0, MAX_PLACE);
+            let (column, row) = (u.trunc(), v.trunc());
+            part_u[i] = u - column;
+            part_v[i] = v - row;
+            cell[i] = mul_add::<FMA>(row, RIMMED as f32, column) as i32 as u32;
         }
-        let first = r * RIMMED + c;
-        let corners = [
-            (first, (1.0 - pr) * (1.0 - pc)),
-            (first + 1, (1.0 - pr) * pc),
-            (first + RIMMED, pr * (1.0 - pc)),
-            (first + RIMMED + 1, pr * pc),
-        ];
-        for (cell, part) in corners {
-            let cell = &mut cells[cell];
-            for k in 0..DIRECTIONS {
-                cell[k] = mul_add::<FMA>(part, shares[k], cell[k]);
+        for (turn, direction) in turn.iter_mut().zip(directions) {
+            let value = mul_add::<FMA>(*direction, TURN / TAU, -shift);
+            *turn = if value < 0.0 { value + TURN } else { value };
+        }
+        first_u += LANES as f32 * stretch.du;
+        first_v += LANES as f32 * stretch.dv;
+        // ... and the adding, for the eight directions at once.
+        for (i, &weight) in weights.iter().enumerate() {
+            let mut shares = [0.0_f32; DIRECTIONS];
+            for (k, share) in shares.iter_mut().enumerate() {
+                let away = (turn[i] - k as f32).abs();
+                let away = away.min(TURN - away);
+                *share = weight * (1.0 - away).max(0.0);
+            }
+            let (pu, pv) = (part_u[i], part_v[i]);
+            let both = pu * pv;
+            let parts = [1.0 - pu - pv + both, pu - both, pv - both, both];
+            let first = (cell[i] as usize).min(MAX_CELL);
+            for (offset, part) in [0, 1, RIMMED, RIMMED + 1].into_iter().zip(parts) {
+                let cell = &mut cells[first + offset];
+                for k in 0..DIRECTIONS {
+                    cell[k] = mul_add::<FMA>(part, shares[k], cell[k]);
+                }
             }
         }
     }

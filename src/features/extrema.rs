@@ -13,9 +13,11 @@ use super::simd::stamp;
 
 /// The fit may move this many rows from the grid extremum.
 pub(super) const MAX_ROW_STEPS: usize = 3;
-/// The fit stays at a grid point whose extremum is this near in every coordinate; slightly more than half, so that an
-/// extremum midway between two does not make it swing.
-pub(super) const MAX_OFFSET: f32 = 0.6;
+/// The fit moves on from a grid point whose extremum is farther than this in some coordinate; slightly more than half, so
+/// that an extremum midway between two seldom makes it swing.
+const MOVE_OFFSET: f32 = 0.6;
+/// Where it swings all the same, the last fit counts if its extremum is no farther than this.
+pub(super) const MAX_OFFSET: f32 = 1.0;
 /// Fits tried per extremum.
 const MAX_FITS: usize = 5;
 /// The grid test passes values above this part of the threshold, since the refined extremum is higher.
@@ -57,7 +59,7 @@ pub(super) fn scan_row(
     found: &mut Vec<usize>,
 ) {
     let row = |s: usize, y: usize| differences[s].row(y);
-    // The middle row of the middle level is first; of equal neighbours the last counts as the extremum.
+    // Of equal neighbours exactly one counts as the extremum: the last.
     let strict = [row(0, y - 1), row(0, y), row(0, y + 1), row(1, y - 1)];
     let lax = [row(1, y + 1), row(2, y - 1), row(2, y), row(2, y + 1)];
     scan(isa, row(1, y), &strict, &lax, width, GRID_PART * options.peak_threshold, found);
@@ -152,7 +154,7 @@ fn extremum_lanes(
 /// below the threshold or the curvatures are those of an edge.
 pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &SiftOptions) -> Option<Extremum> {
     let (mut x, mut y, mut s, first_y) = (x, y, s, y);
-    for _ in 0..MAX_FITS {
+    for fit in 1..=MAX_FITS {
         let cube = neighbourhood(levels, x, y, s);
         let at = |dx: usize, dy: usize, ds: usize| cube[ds][dy][dx];
         let value = at(1, 1, 1);
@@ -169,7 +171,7 @@ pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &Si
         if !offset.iter().all(|component| component.is_finite()) {
             return None;
         }
-        if offset.amax() <= MAX_OFFSET {
+        if offset.amax() <= if fit < MAX_FITS { MOVE_OFFSET } else { MAX_OFFSET } {
             let contrast = value + 0.5 * gradient.dot(&offset);
             let (trace, determinant) = (xx + yy, xx * yy - xy * xy);
             let edge = options.edge_threshold;
@@ -188,11 +190,11 @@ pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &Si
     None
 }
 
-/// One grid step towards an offset beyond [`MAX_OFFSET`]; none when it leaves `[least, most]`.
+/// One grid step towards an offset beyond [`MOVE_OFFSET`]; none when it leaves `[least, most]`.
 fn step(at: usize, offset: f32, least: usize, most: usize) -> Option<usize> {
-    let next = if offset > MAX_OFFSET {
+    let next = if offset > MOVE_OFFSET {
         at + 1
-    } else if offset < -MAX_OFFSET {
+    } else if offset < -MOVE_OFFSET {
         at - 1
     } else {
         at

@@ -8,32 +8,51 @@ use super::simd::{Isa, mul_add, stamp};
 /// Keeps the quotient of two vanishing gradients finite; far below any gradient of 8-bit pixels.
 const TINY: f32 = 1e-30;
 
-/// Longest stretch of one row that is looked at; descriptors of the largest sigma reach 2 x 60 pixels.
-pub(super) const MAX_STRETCH: usize = 512;
+/// Pixels computed together; stretches are computed in whole multiples.
+pub(super) const LANES: usize = 16;
+/// Room for the longest stretch of one row that is looked at: across the widest descriptor of the largest sigma.
+const MAX_STRETCH: usize = 1024;
 
-/// Gradients of a stretch of one row.
+/// Gradients of a stretch of one row, and the buffers for their weights.
 pub(super) struct Patch {
-    /// Length of the gradient.
-    pub(super) magnitude: Vec<f32>,
-    /// Its direction in [0, 2 pi), from +x to +y.
+    /// Weight of each column of the window, set by [`Patch::set_window`].
+    window: Vec<f32>,
+    window_from: usize,
+    /// Length of the gradient times its weight.
+    pub(super) weight: Vec<f32>,
+    /// Direction in [0, 2 pi), from +x to +y.
     pub(super) direction: Vec<f32>,
 }
 
 impl Patch {
     /// Room for the longest stretch.
     pub(super) fn new() -> Self {
-        Self { magnitude: vec![0.0; MAX_STRETCH], direction: vec![0.0; MAX_STRETCH] }
+        let zeros = || vec![0.0; MAX_STRETCH];
+        Self { window: zeros(), window_from: 0, weight: zeros(), direction: zeros() }
     }
 
-    /// Gradients of pixels `from..to` of row `y` by central differences; none of them may lie on the border.
-    pub(super) fn fill(&mut self, isa: Isa, ring: &Ring, y: usize, from: usize, to: usize) {
+    /// Sets the columns' part of the Gaussian window exp(falloff (dx^2 + dy^2)) around `x`, for columns `from..to`.
+    pub(super) fn set_window(&mut self, x: f32, falloff: f32, from: usize, to: usize) {
+        self.window_from = from;
+        for (column, weight) in (from..to).zip(&mut self.window) {
+            *weight = (falloff * (column as f32 - x).powi(2)).exp();
+        }
+    }
+
+    /// Gradients of pixels `from..to` of row `y` by central differences, weighted by the window's columns and
+    /// `row_weight`; no pixel may lie on the border or outside the window.
+    pub(super) fn fill(&mut self, isa: Isa, ring: &Ring, y: usize, from: usize, to: usize, row_weight: f32) {
+        let length = (to - from).next_multiple_of(LANES);
+        let first = from - self.window_from;
         gradients(
             isa,
-            &ring.row(y - 1)[from..to],
-            &ring.row(y + 1)[from..to],
-            &ring.row(y)[from - 1..to + 1],
-            &mut self.magnitude[..to - from],
-            &mut self.direction[..to - from],
+            ring.stretch(y - 1, from, length),
+            ring.stretch(y + 1, from, length),
+            ring.stretch(y, from - 1, length + 2),
+            &self.window[first..first + length],
+            row_weight,
+            &mut self.weight[..length],
+            &mut self.direction[..length],
         );
     }
 }
@@ -41,25 +60,32 @@ impl Patch {
 stamp!(
     /// See [`Patch::fill`].
     gradients => gradients_body(
-        above: &[f32], below: &[f32], row: &[f32], magnitude: &mut [f32], direction: &mut [f32],
+        above: &[f32], below: &[f32], row: &[f32], window: &[f32], row_weight: f32,
+        weight: &mut [f32], direction: &mut [f32],
     )
 );
 
 #[inline(always)]
+#[allow(clippy::too_many_arguments)]
 fn gradients_body<const FMA: bool>(
     above: &[f32],
     below: &[f32],
     row: &[f32],
-    magnitude: &mut [f32],
+    window: &[f32],
+    row_weight: f32,
+    weight: &mut [f32],
     direction: &mut [f32],
 ) {
-    let count = magnitude.len();
-    let (above, below, direction) = (&above[..count], &below[..count], &mut direction[..count]);
-    let (left, right) = (&row[..count], &row[2..count + 2]);
-    for i in 0..count {
-        let (gx, gy) = (right[i] - left[i], below[i] - above[i]);
-        magnitude[i] = (gx * gx + gy * gy).sqrt();
-        direction[i] = direction_of::<FMA>(gx, gy);
+    let blocks = weight.chunks_exact_mut(LANES).zip(direction.chunks_exact_mut(LANES));
+    for (block, (weight, direction)) in blocks.enumerate() {
+        let span = block * LANES..(block + 1) * LANES;
+        let (above, below, window) = (&above[span.clone()], &below[span.clone()], &window[span.clone()]);
+        let (left, right) = (&row[span.clone()], &row[span.start + 2..span.end + 2]);
+        for i in 0..LANES {
+            let (gx, gy) = (right[i] - left[i], below[i] - above[i]);
+            weight[i] = (gx * gx + gy * gy).sqrt() * window[i] * row_weight;
+            direction[i] = direction_of::<FMA>(gx, gy);
+        }
     }
 }
 

@@ -30,8 +30,11 @@ pub(super) fn find(
     let window = WINDOW_SIGMAS * sigma;
     let radius = CUTOFF * window;
     let falloff = -0.5 / (window * window);
-    let mut histogram = [0.0_f32; BINS];
+    // One bin more takes what the last shares with the first.
+    let mut histogram = [0.0_f32; BINS + 1];
     let (top, bottom) = clip(y, radius, height);
+    let (from, to) = clip(x, radius, width);
+    patch.set_window(x, falloff, from, to);
     for row in top..bottom {
         let dy = row as f32 - y;
         let half = (radius * radius - dy * dy).max(0.0).sqrt();
@@ -39,17 +42,17 @@ pub(super) fn find(
         if left >= right {
             continue;
         }
-        patch.fill(isa, ring, row, left, right);
-        for column in left..right {
-            let dx = column as f32 - x;
-            let weight = patch.magnitude[column - left] * (falloff * (dx * dx + dy * dy)).exp();
-            let place = patch.direction[column - left] * (BINS as f32 / TAU);
-            let bin = place as usize;
-            let part = place - bin as f32;
-            histogram[bin % BINS] += weight * (1.0 - part);
-            histogram[(bin + 1) % BINS] += weight * part;
+        patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
+        for (weight, direction) in patch.weight.iter().zip(&patch.direction).take(right - left) {
+            let place = direction * (BINS as f32 / TAU);
+            let bin = (place as usize).min(BINS - 1);
+            let part = weight * (place - bin as f32);
+            histogram[bin] += weight - part;
+            histogram[bin + 1] += part;
         }
     }
+    histogram[0] += histogram[BINS];
+    let mut histogram: [f32; BINS] = std::array::from_fn(|i| histogram[i]);
     for _ in 0..SMOOTHINGS {
         let at = |i: usize| histogram[i % BINS];
         histogram = std::array::from_fn(|i| {

@@ -10,6 +10,7 @@ pub(super) fn padded(length: usize) -> usize {
 
 /// The last `capacity` rows of an image.
 pub(super) struct Ring {
+    /// Values a row takes: whole blocks and a block of margin, so that a stretch of whole blocks may start at any pixel.
     stride: usize,
     capacity: usize,
     next: usize,
@@ -19,7 +20,7 @@ pub(super) struct Ring {
 impl Ring {
     /// An empty ring for rows of `width` values.
     pub(super) fn new(width: usize, capacity: usize) -> Self {
-        let stride = padded(width);
+        let stride = padded(width) + BLOCK;
         Self { stride, capacity, next: 0, data: vec![0.0; stride * capacity] }
     }
 
@@ -33,13 +34,21 @@ impl Ring {
     pub(super) fn row(&self, y: usize) -> &[f32] {
         debug_assert!(y < self.next && y + self.capacity >= self.next, "row {y} of {} is gone", self.next);
         let start = (y % self.capacity) * self.stride;
-        &self.data[start..start + self.stride]
+        &self.data[start..start + self.stride - BLOCK]
+    }
+
+    /// `length` values of row `y` from column `from` on, which may end in the margin.
+    #[inline]
+    pub(super) fn stretch(&self, y: usize, from: usize, length: usize) -> &[f32] {
+        debug_assert!(y < self.next && y + self.capacity >= self.next && from + length <= self.stride);
+        let start = (y % self.capacity) * self.stride + from;
+        &self.data[start..start + length]
     }
 
     /// Makes room for the next row and returns it, to be filled.
     pub(super) fn push(&mut self) -> &mut [f32] {
         let start = (self.next % self.capacity) * self.stride;
         self.next += 1;
-        &mut self.data[start..start + self.stride]
+        &mut self.data[start..start + self.stride - BLOCK]
     }
 }
