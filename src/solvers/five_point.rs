@@ -157,8 +157,8 @@ fn constraints(e: &[[Linear; 3]; 3]) -> [Cubic; 10] {
     let mut s = [[[0.0; 10]; 3]; 3];
     for i in 0..3 {
         for j in i..3 {
-            for k in 0..3 {
-                add_product(&mut s[i][j], &e[i][k], &e[j][k]);
+            for (left, right) in e[i].iter().zip(&e[j]) {
+                add_product(&mut s[i][j], left, right);
             }
         }
     }
