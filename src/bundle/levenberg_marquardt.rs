@@ -21,7 +21,7 @@ use nalgebra::Vector3;
 /// Least ratio of actual to promised decrease for a step to be taken. Ceres' default.
 const MIN_RATIO: f64 = 1e-3;
 /// Bounds of the damping: below, it no longer matters; above, no step is left.
-const MIN_DAMPING: f64 = 1e-16;
+const MIN_DAMPING: f64 = 1e-12;
 const MAX_DAMPING: f64 = 1e16;
 
 /// How the loop went.

@@ -1,20 +1,21 @@
 //! One damped step, against the full normal equations solved densely.
 
 use super::*;
-use crate::bundle::config::{BundleConfig, FocalPrior, FreeIntrinsics};
+use crate::bundle::config::{BundleConfig, FocalPrior, FreeIntrinsics, Gauge};
 use crate::camera::CameraModel;
 use crate::math::{RobustLoss, skew};
 use crate::scene::Reconstruction;
 use crate::synthetic::{Layout, SceneOptions, generate, perturbed};
 use nalgebra::{DMatrix, DVector};
 
-fn config(model: &Reconstruction) -> BundleConfig {
+fn config(model: &Reconstruction, gauge: Gauge) -> BundleConfig {
     let free = model.cameras.keys().map(|&id| (id, FreeIntrinsics::ALL)).collect();
     let priors = model.cameras.keys().map(|&id| (id, FocalPrior { focal_px: 1000.0, sigma_log: 0.05 })).collect();
     BundleConfig {
+        gauge,
         intrinsics: free,
         focal_priors: priors,
-        constant_points: model.points().take(2).map(|(id, _)| id).collect(),
+        constant_points: model.points().take(1).map(|(id, _)| id).collect(),
         ..BundleConfig::global(model, FreeIntrinsics::default())
     }
 }
@@ -93,7 +94,7 @@ fn eliminating_the_points_gives_the_full_step() {
             let model = perturbed(&generate(&scene).truth, 0.5, 0.01, 0.02, false, 3);
             let loss = RobustLoss::Cauchy { scale: 20.0 };
             let options = BundleOptions { loss, max_dense_unknowns, ..Default::default() };
-            let (problem, state) = Problem::build(&model, &config(&model), &options);
+            let (problem, state) = Problem::build(&model, &config(&model, Gauge::TwoImages), &options);
             let mut minimizer = Minimizer::new(&problem, &options).unwrap();
             assert_eq!(minimizer.pattern.sparse.is_some(), max_dense_unknowns == 0, "{shared_camera}");
             let damping = 1e-3;
@@ -119,7 +120,7 @@ fn the_gradient_is_that_of_the_cost() {
     let scene = SceneOptions { camera_model: CameraModel::OpenCv, num_images: 4, num_points: 60, ..Default::default() };
     let model = perturbed(&generate(&scene).truth, 0.5, 0.01, 0.02, false, 3);
     let options = BundleOptions { loss: RobustLoss::SoftL1 { scale: 5.0 }, ..Default::default() };
-    let (problem, state) = Problem::build(&model, &config(&model), &options);
+    let (problem, state) = Problem::build(&model, &config(&model, Gauge::TwoImages), &options);
     let mut minimizer = Minimizer::new(&problem, &options).unwrap();
     minimizer.linearise(&state, 1e300);
     let gradient = minimizer.parts[0].gradient.clone();
