@@ -36,8 +36,10 @@ CREATE TABLE jobs (
     options          TEXT    NOT NULL,
     -- Files of the job's own upload that were no photographs; null for a dataset made before.
     ignored          INTEGER,
-    -- How often the process ended under the running job, so that a job that kills the process does not do so for ever.
+    -- How often in a row the process ended under the running job, and the stages that were finished when it last did: a job
+    -- that kills the process at one place does not do so for ever.
     interruptions    INTEGER NOT NULL DEFAULT 0,
+    stages_finished  INTEGER NOT NULL DEFAULT 0,
     -- JSON: the models of the report, null until there is a report.
     models           TEXT,
     error_stage      TEXT,

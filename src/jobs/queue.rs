@@ -218,6 +218,7 @@ impl Jobs {
         }
         let dataset = row.dataset_id.parse().map_err(|_| JobsError::DatasetNotFound)?;
         row.interruptions = 0;
+        row.stages_finished = 0;
         row.models = None;
         row.started_ms = None;
         job_images::freeze(&mut tx, id, dataset).await?;

@@ -1,6 +1,5 @@
 //! What start-up mends after the process ended at any moment.
 
-use sqlx::SqliteConnection;
 use uuid::Uuid;
 
 use super::JobState;
@@ -9,7 +8,7 @@ use super::view::{CurrentStage, ErrorView};
 use crate::store::db::{datasets, job_stages, jobs};
 use crate::store::{Store, StoreError};
 
-/// The process may end so often under a job without any stage coming to its end in between; then the job is to blame.
+/// The process may end so often under a job without a further stage coming to its end; then the job is to blame.
 const MAX_INTERRUPTIONS: i64 = 10;
 
 /// What was mended.
@@ -34,13 +33,17 @@ pub async fn recover(store: &Store) -> Result<Recovered, StoreError> {
     let mut tx = store.db.write().await?;
     for mut row in jobs::in_state(&mut tx, "running").await? {
         let id = job_id(&row)?;
-        row.interruptions = if made_progress(&mut tx, id).await? { 0 } else { row.interruptions + 1 };
+        let stages = job_stages::list(&mut *tx, id).await?;
+        let finished = stages.iter().filter(|stage| stage.state == "done" || stage.state == "reused").count();
+        let finished = i64::try_from(finished).unwrap_or(i64::MAX);
+        row.interruptions = if finished > row.stages_finished { 1 } else { row.interruptions + 1 };
+        row.stages_finished = row.stages_finished.max(finished);
         if row.cancel_requested {
             recovered.cancelled += 1;
             transition(&mut tx, &mut row, JobState::Cancelled, None).await?;
         } else if row.interruptions >= MAX_INTERRUPTIONS {
             recovered.given_up += 1;
-            let stage = CurrentStage::among(&job_stages::list(&mut *tx, id).await?).map(|stage| stage.name);
+            let stage = CurrentStage::among(&stages).map(|stage| stage.name);
             let message =
                 format!("the service ended {MAX_INTERRUPTIONS} times while this stage ran, perhaps for want of memory");
             let error = ErrorView { stage, code: "interrupted".to_owned(), message };
@@ -62,9 +65,4 @@ pub async fn recover(store: &Store) -> Result<Recovered, StoreError> {
         store.data.discard(&folder)?;
     }
     Ok(recovered)
-}
-
-/// Whether any stage of the latest attempt came to its end.
-async fn made_progress(tx: &mut SqliteConnection, job: Uuid) -> sqlx::Result<bool> {
-    Ok(job_stages::list(tx, job).await?.iter().any(|stage| stage.state == "done"))
 }

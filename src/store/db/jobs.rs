@@ -30,8 +30,10 @@ pub struct JobRow {
     pub options: String,
     /// Files of its upload that were no photographs.
     pub ignored: Option<i64>,
-    /// How often the process ended under it.
+    /// How often in a row the process ended under it without a further stage finished.
     pub interruptions: i64,
+    /// Stages that were finished when the process last ended under it.
+    pub stages_finished: i64,
     /// JSON, null without a report.
     pub models: Option<String>,
     /// The stage that failed.
@@ -103,14 +105,15 @@ pub async fn in_state(db: &mut SqliteConnection, state: &str) -> sqlx::Result<Ve
 /// Writes the columns that change with the state.
 pub async fn update_state(db: &mut SqliteConnection, job: &JobRow) -> sqlx::Result<()> {
     sqlx::query(
-        "UPDATE jobs SET state = ?, cancel_requested = ?, started_ms = ?, finished_ms = ?, interruptions = ?, models = ?,
-         error_stage = ?, error_code = ?, error_message = ? WHERE id = ?",
+        "UPDATE jobs SET state = ?, cancel_requested = ?, started_ms = ?, finished_ms = ?, interruptions = ?, stages_finished = ?,
+         models = ?, error_stage = ?, error_code = ?, error_message = ? WHERE id = ?",
     )
     .bind(&job.state)
     .bind(job.cancel_requested)
     .bind(job.started_ms)
     .bind(job.finished_ms)
     .bind(job.interruptions)
+    .bind(job.stages_finished)
     .bind(&job.models)
     .bind(&job.error_stage)
     .bind(&job.error_code)
