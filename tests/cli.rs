@@ -4,6 +4,8 @@
 
 #[path = "cli/evaluate.rs"]
 mod evaluate;
+#[path = "cli/reconstruct.rs"]
+mod reconstruct;
 
 use std::process::{Command, Output};
 

@@ -6,3 +6,5 @@
 mod models;
 #[path = "formats/photographs.rs"]
 mod photographs;
+#[path = "formats/report_html.rs"]
+mod report_html;

@@ -5,6 +5,9 @@
 
 mod evaluate;
 mod model_poses;
+mod options;
+mod progress;
+mod reconstruct;
 mod serve;
 
 use std::process::ExitCode;
@@ -24,6 +27,8 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Make a model of the photographs in a folder.
+    Reconstruct(reconstruct::Args),
     /// Measure the camera poses of a model against a reference.
     Evaluate(evaluate::Args),
     /// Run the web service, with its page.
@@ -35,8 +40,12 @@ enum Command {
 enum Failure {
     /// Bad arguments or input.
     Input(String),
+    /// The photographs gave no model.
+    NoModel,
     /// Something outside failed.
     Outside(String),
+    /// Somebody asked to stop.
+    Interrupted,
 }
 
 impl Failure {
@@ -44,6 +53,8 @@ impl Failure {
         match self {
             Self::Outside(_) => 1,
             Self::Input(_) => 2,
+            Self::NoModel => 3,
+            Self::Interrupted => 130,
         }
     }
 }
@@ -51,6 +62,7 @@ impl Failure {
 /// Parses the arguments, runs the command, and says how it went.
 pub fn run() -> ExitCode {
     let result = match Cli::parse().command {
+        Command::Reconstruct(args) => reconstruct::run(args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Serve(args) => serve::run(&args),
     };
@@ -59,6 +71,10 @@ pub fn run() -> ExitCode {
         Err(failure) => {
             match &failure {
                 Failure::Input(message) | Failure::Outside(message) => eprintln!("error: {message}"),
+                Failure::NoModel => eprintln!("The photographs gave no model; the report says why."),
+                Failure::Interrupted => {
+                    eprintln!("Interrupted; the same command goes on from the last finished stage.")
+                }
             }
             ExitCode::from(failure.exit_code())
         }

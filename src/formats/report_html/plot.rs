@@ -39,7 +39,9 @@ const MAX_POINTS: usize = 12_000;
 /// Share of the points on either side that may fall outside: stray points must not shrink the rest.
 const STRAY_SHARE: f64 = 0.02;
 /// Length of a camera's wedge in SVG units.
-const WEDGE: f64 = 13.0;
+const WEDGE: f64 = 16.0;
+/// Diameter of a dot in SVG units: of few points, and of as many as are drawn at most.
+const DOT: (f64, f64) = (2.6, 1.5);
 
 /// World to page.
 struct Frame {
@@ -125,11 +127,13 @@ fn write_points(model: &Reconstruction, frame: &Frame, out: &mut impl Write) -> 
     for (_, point) in model.points().step_by(stride) {
         let at = frame.place(&point.xyz);
         if frame.holds(&at) {
-            // Eight levels a channel, each drawn in the middle of its range.
-            groups.entry(point.color.map(|level| (level & 0xe0) | 0x10)).or_default().push(at);
+            // Eight levels a channel, from dark grey (so that black points show on the dark ground) to white.
+            groups.entry(point.color.map(|level| 0x48 + (level >> 5) * 0x1a)).or_default().push(at);
         }
     }
-    write!(out, "<g fill=\"none\" stroke-width=\"1.7\" stroke-linecap=\"round\">")?;
+    let share = (model.num_points() as f64 / MAX_POINTS as f64).min(1.0);
+    let dot = DOT.0 + share * (DOT.1 - DOT.0);
+    write!(out, "<g fill=\"none\" stroke-width=\"{dot:.1}\" stroke-linecap=\"round\">")?;
     for ([r, g, b], places) in groups {
         write!(out, "<path stroke=\"#{r:02x}{g:02x}{b:02x}\" d=\"")?;
         for at in places {
