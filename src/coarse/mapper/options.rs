@@ -76,7 +76,7 @@ impl Default for MapperOptions {
             min_pose_inliers: 30,
             min_pose_inliers_relaxed: 15,
             max_registration_trials: 3,
-            pose: AbsolutePoseOptions::default(),
+            pose: AbsolutePoseOptions { min_inlier_ratio: 0.25, ..AbsolutePoseOptions::default() },
             max_reprojection_error_px: 4.0,
             min_triangulation_angle_deg: 1.5,
             local_images: 6,

@@ -63,26 +63,29 @@ pub(super) fn to_rgb(image: &DynamicImage) -> RgbImage {
     RgbImage::new(width, height, data)
 }
 
-/// Reduces the longer side to `max_long_side`, where it is longer.
+/// Reduces the longer side to `max_long_side`, where it is longer. The Catmull-Rom filter of the image crate widens with the
+/// reduction, so it neither aliases nor shifts: the corner of the first pixel stays at (0, 0).
 pub(super) fn shrink_gray(image: GrayImage, max_long_side: Option<u32>) -> Decoded<GrayImage> {
     let GrayImage { width, height, data } = image;
     let Some((new_width, new_height)) = reduced_size(width, height, max_long_side) else {
         return Decoded { image: GrayImage::new(width, height, data), to_original: [1.0, 1.0] };
     };
-    let data = resize::<Luma<u8>>(data, (width, height), (new_width, new_height));
+    let source = raster::<Luma<u8>>(data, width, height);
+    let data = imageops::resize(&source, new_width as u32, new_height as u32, FilterType::CatmullRom).into_raw();
     Decoded {
         image: GrayImage::new(new_width, new_height, data),
         to_original: [width as f64 / new_width as f64, height as f64 / new_height as f64],
     }
 }
 
-/// Reduces the longer side to `max_long_side`, where it is longer.
+/// Reduces the longer side to `max_long_side`, where it is longer, by averaging: colours and thumbnails need no better.
 pub fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbImage> {
     let RgbImage { width, height, data } = image;
     let Some((new_width, new_height)) = reduced_size(width, height, max_long_side) else {
         return Decoded { image: RgbImage::new(width, height, data), to_original: [1.0, 1.0] };
     };
-    let data = resize::<Rgb<u8>>(data, (width, height), (new_width, new_height));
+    let source = raster::<Rgb<u8>>(data, width, height);
+    let data = imageops::thumbnail(&source, new_width as u32, new_height as u32).into_raw();
     Decoded {
         image: RgbImage::new(new_width, new_height, data),
         to_original: [width as f64 / new_width as f64, height as f64 / new_height as f64],
@@ -97,10 +100,7 @@ fn reduced_size(width: usize, height: usize, max_long_side: Option<u32>) -> Opti
     (longer > target).then(|| (scaled(width), scaled(height)))
 }
 
-/// The Catmull-Rom filter of the image crate widens with the reduction, so it neither aliases nor shifts: the corner of the
-/// first pixel stays at (0, 0).
-fn resize<P: Pixel<Subpixel = u8> + 'static>(data: Vec<u8>, from: (usize, usize), to: (usize, usize)) -> Vec<u8> {
-    let source: ImageBuffer<P, Vec<u8>> = ImageBuffer::from_raw(from.0 as u32, from.1 as u32, data)
-        .expect("the raster's length was checked when it was made");
-    imageops::resize(&source, to.0 as u32, to.1 as u32, FilterType::CatmullRom).into_raw()
+/// The raster as the image crate has it.
+fn raster<P: Pixel<Subpixel = u8>>(data: Vec<u8>, width: usize, height: usize) -> ImageBuffer<P, Vec<u8>> {
+    ImageBuffer::from_raw(width as u32, height as u32, data).expect("the raster's length was checked when it was made")
 }
