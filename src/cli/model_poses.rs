@@ -38,9 +38,9 @@ pub fn read(path: &Path) -> Result<NamedPoses, PosesError> {
     }
     let name = path.file_name().map(|name| name.to_string_lossy().to_lowercase()).unwrap_or_default();
     if name.ends_with(".nvm") {
-        read_file(path, |input| poses::read_nvm_poses(input))
+        read_file(path, poses::read_nvm_poses)
     } else if name.ends_with("poses.txt") {
-        read_file(path, |input| poses::read_pose_list(input))
+        read_file(path, poses::read_pose_list)
     } else if name.ends_with(".out") {
         read_bundle(path)
     } else if path.exists() {
@@ -56,7 +56,7 @@ fn read_folder(folder: &Path) -> Result<NamedPoses, PosesError> {
     if !cameras.is_empty() {
         let mut found = NamedPoses::new();
         for path in cameras {
-            let pose = read_file(&path, |input| poses::read_strecha_camera(input))?;
+            let pose = read_file(&path, poses::read_strecha_camera)?;
             let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
             found.insert(name, pose);
         }
@@ -99,8 +99,8 @@ fn camera_files(folder: &Path) -> Result<Vec<PathBuf>, PosesError> {
 }
 
 fn read_bundle(path: &Path) -> Result<NamedPoses, PosesError> {
-    let found = read_file(path, |input| bundler::read_bundle_poses(input))?;
-    let names = read_file(&path.with_file_name("list.txt"), |input| bundler::read_list(input))?;
+    let found = read_file(path, bundler::read_bundle_poses)?;
+    let names = read_file(&path.with_file_name("list.txt"), bundler::read_list)?;
     Ok(names.into_iter().zip(found).filter_map(|(name, pose)| Some((name, pose?))).collect())
 }
 

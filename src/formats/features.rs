@@ -3,7 +3,7 @@
 //! Little-endian: magic `MSFEAT01`, count (u64), `count` keypoints of four f32 (x, y, scale, orientation), `count` descriptors
 //! of 128 bytes. The fixed order lets a reader take the largest scales alone.
 
-use crate::scene::{DESCRIPTOR_LEN, Descriptor, Features, Keypoint};
+use crate::scene::{DESCRIPTOR_LEN, Features, Keypoint};
 
 const MAGIC: &[u8; 8] = b"MSFEAT01";
 const HEADER_LEN: usize = 16;
@@ -66,10 +66,7 @@ pub fn from_bytes(bytes: &[u8], limit: Option<usize>) -> Result<Features, Featur
     });
     let descriptors_at = HEADER_LEN + count * KEYPOINT_LEN;
     let descriptors = bytes[descriptors_at..].as_chunks::<DESCRIPTOR_LEN>().0;
-    Ok(Features {
-        keypoints: keypoints.collect(),
-        descriptors: descriptors[..taken].iter().map(|d| -> Descriptor { *d }).collect(),
-    })
+    Ok(Features { keypoints: keypoints.collect(), descriptors: descriptors[..taken].to_vec() })
 }
 
 #[cfg(test)]

@@ -82,7 +82,7 @@ impl StageProgress<'_> {
     }
 
     fn tell(&self, state: &mut (u64, u64), done: u64, total: u64) {
-        let percent = if total == 0 { 0 } else { 1 + 100 * done.min(total) / total };
+        let percent = (100 * done.min(total)).checked_div(total).map_or(0, |percent| 1 + percent);
         if percent != state.1 || done >= total {
             state.1 = percent;
             self.context.progress.report(ProgressEvent::StageProgress { stage: self.stage, done, total });

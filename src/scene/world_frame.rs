@@ -28,7 +28,9 @@ pub fn level(model: &mut Reconstruction, orientation: &BTreeMap<ImageId, u8>) {
     let level_from_world = UnitQuaternion::rotation_between(&up, &Vector3::z())
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
     let centers: Vec<Vector3<f64>> = model.images().values().map(|image| image.center_in_world()).collect();
-    let center = Vector3::from_fn(|axis, _| median(centers.iter().map(|center| center[axis]).collect()));
+    let leveled: Vec<Vector3<f64>> = centers.iter().map(|center| level_from_world * center).collect();
+    let middle = Vector3::from_fn(|axis, _| median(leveled.iter().map(|center| center[axis]).collect()));
+    let center = level_from_world.inverse() * middle;
     let mut distances: Vec<f64> = centers.iter().map(|other| (other - center).norm()).collect();
     distances.sort_by(f64::total_cmp);
     let extent = distances[((distances.len() - 1) as f64 * EXTENT_QUANTILE) as usize];
