@@ -3,12 +3,14 @@
 //! Exit status: 0 done (for `reconstruct`: a model was made); 1 something outside failed, such as a full disk; 2 bad
 //! arguments or input; 3 the photographs gave no model; 130 interrupted.
 
+mod demo;
 mod evaluate;
 mod model_poses;
 mod options;
 mod progress;
 mod reconstruct;
 mod serve;
+mod synthesize;
 
 use std::process::ExitCode;
 
@@ -29,10 +31,14 @@ struct Cli {
 enum Command {
     /// Make a model of the photographs in a folder.
     Reconstruct(reconstruct::Args),
+    /// Photograph a synthetic temple, reconstruct it by the service, and keep serving.
+    Demo(demo::Args),
     /// Measure the camera poses of a model against a reference.
     Evaluate(evaluate::Args),
     /// Run the web service, with its page.
     Serve(serve::Args),
+    /// Make photographs or features of a scene whose truth is known.
+    Synthesize(synthesize::Args),
 }
 
 /// How a command ended otherwise than well.
@@ -63,8 +69,10 @@ impl Failure {
 pub fn run() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Reconstruct(args) => reconstruct::run(args),
+        Command::Demo(args) => demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Serve(args) => serve::run(&args),
+        Command::Synthesize(args) => synthesize::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

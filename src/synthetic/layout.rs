@@ -93,7 +93,7 @@ impl SurfacePoint {
 }
 
 /// `cam_from_world` of a camera that looks at `target`, upright but for a roll.
-fn look_at(center_in_world: &Vector3<f64>, target_in_world: &Vector3<f64>, roll_rad: f64) -> Rigid3 {
+pub(super) fn look_at(center_in_world: &Vector3<f64>, target_in_world: &Vector3<f64>, roll_rad: f64) -> Rigid3 {
     let forward = (target_in_world - center_in_world).normalize();
     let right = forward.cross(&Vector3::z()).normalize();
     let down = forward.cross(&right);

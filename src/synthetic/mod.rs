@@ -3,7 +3,11 @@
 mod compare;
 mod layout;
 mod scene;
+mod temple;
+mod temple_solids;
+mod temple_stone;
 
 pub use compare::{ModelDifference, compare};
 pub use layout::Layout;
 pub use scene::{PairMatches, SceneOptions, SyntheticScene, generate, perturbed};
+pub use temple::{Temple, TempleOptions};
