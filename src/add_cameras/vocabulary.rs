@@ -4,12 +4,16 @@
 //! the training set (always the same ones), with exact nearest centres from the matching kernels and centres rounded to bytes, so that
 //! training is exact integer work and the same everywhere. The coarser level clusters the centres of the finer one.
 
+use rayon::prelude::*;
+
 use crate::matching::descriptor::{PackedDescriptors, Top2, top2};
 use crate::math::Rng;
 use crate::scene::{DESCRIPTOR_LEN, Descriptor};
 
 use super::VocabularyOptions;
 
+/// Descriptors one thread looks up at a time: enough to pay for handing them out.
+const CHUNK: usize = 1024;
 /// The random stream that picks the first centres.
 const STREAM: u64 = 0x776f_7264;
 
@@ -59,10 +63,14 @@ impl Vocabulary {
     }
 }
 
+/// The nearest centre of every descriptor; empty when there are no centres.
 fn nearest(descriptors: &[Descriptor], centers: &PackedDescriptors) -> Vec<Word> {
-    let mut found: Vec<Top2> = Vec::new();
-    top2(descriptors, centers, &mut found);
-    found.into_iter().map(|found| found.index).collect()
+    let chunks = descriptors.par_chunks(CHUNK).map(|chunk| {
+        let mut found: Vec<Top2> = Vec::new();
+        top2(chunk, centers, &mut found);
+        found.into_iter().map(|found| found.index).collect::<Vec<Word>>()
+    });
+    chunks.flatten_iter().collect()
 }
 
 /// At most `count` centres of clusters of `members`. A centre that loses all members stays where it is.
