@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs every check and ends with one line: N passed, N failed, N skipped. Logs are kept in target/test-logs.
 #
-# A test that can't run here prints a line "SKIPPED: why" and returns; it is then counted as skipped, not as passed.
+# A test that can't run here prints a line "SKIPPED: why" (in any case) and returns; it is then counted as skipped, not as passed.
 cd "$(dirname "$0")/.." || exit 1
 logs=target/test-logs
 mkdir -p "$logs"
@@ -43,11 +43,11 @@ status=$?
 read -r p f s < <(awk '
   /^test result:/ { for (i = 1; i < NF; i++) { if ($(i+1) == "passed;") p += $i; if ($(i+1) == "failed;") f += $i; if ($(i+1) == "ignored;") s += $i } binary++ }
   /^---- .* stdout ----$/ { test = binary "/" $2 }
-  /^SKIPPED:/ && !(test in seen) { seen[test] = 1; skips++ }
+  tolower($0) ~ /^skipped:/ && !(test in seen) { seen[test] = 1; skips++ }
   END { print p - skips, f + 0, s + skips }' "$log")
 # A test program that does not compile or dies reports no result of its own.
 [ "$status" != 0 ] && [ "$f" = 0 ] && f=1
-grep -E '^(SKIPPED:|test .* FAILED|error)' "$log" | sort -u
+grep -iE '^(skipped:|test .* failed|error)' "$log" | sort -u
 [ "$status" != 0 ] && grep -vE '^(test .* ok|running|     Running|successes:|warning)' "$log" | tail -n 80
 echo "cargo test: $p passed, $f failed, $s skipped"
 passed=$((passed + p)) failed=$((failed + f)) skipped=$((skipped + s))
