@@ -68,6 +68,13 @@ export class Selection {
     return sum;
   }
 
+  /** The pictures by the path they get in the job: below the folder that holds everything, where there is one. */
+  get named() {
+    const { folder } = this;
+    const cut = this.archives.size === 0 && folder !== "" ? folder.length + 1 : 0;
+    return [...this.pictures].map(([path, file]) => [path.slice(cut), file]);
+  }
+
   /** A name for the job: the folder that holds everything, else nothing. */
   get folder() {
     const tops = new Set([...this.pictures.keys()].map((path) => (path.includes("/") ? path.split("/")[0] : "")));

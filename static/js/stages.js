@@ -107,7 +107,7 @@ function row() {
     if (state === "running" && stage.total) bar.value = stage.done / stage.total;
     else bar.removeAttribute("value");
     time.textContent = state === "running" && stage.total ? `${count(stage.done)} / ${count(stage.total)}` : state === "reused" ? "kept" : stage.wall_s === null ? "" : duration(stage.wall_s);
-    counts.textContent = Object.entries(stage.counts ?? {}).map(([name, value]) => `${MEASURE.test(name) ? value.toFixed(2) : count(value)} ${name.replaceAll("_", " ")}`).join(" \u00b7 ");
+    counts.textContent = Object.entries(stage.counts ?? {}).map(([name, value]) => `${name.replaceAll("_", " ")} ${MEASURE.test(name) ? value.toFixed(2) : count(value)}`).join(" \u00b7 ");
     counts.hidden = counts.textContent === "";
   }
   return { element, update };

@@ -15,7 +15,7 @@ export function batches(selection) {
   const all = [];
   let batch = [];
   let size = 0;
-  for (const [path, file] of selection.pictures) {
+  for (const [path, file] of selection.named) {
     if (batch.length > 0 && (batch.length >= BATCH_FILES || size + file.size > BATCH_BYTES)) {
       all.push(batch);
       batch = [];

@@ -97,6 +97,29 @@ test("photographs become a model on the page, and its points can be downloaded",
   assert.equal(download.suggestedFilename(), "points.ply");
   const file = await readFile(await download.path());
   assert.match(file.subarray(0, 400).toString("latin1"), new RegExp(`^ply\\nformat binary_little_endian 1.0\\n[^]*element vertex ${points}\\n`));
+
+  // The viewer names the picture behind a frustum by its place in cameras.ply: that must be the order of the paths.
+  const [named, ordered] = await page.evaluate(async () => {
+    const { parsePly } = await import("/static/js/viewer/ply.js");
+    const folder = `/api/v1/jobs/${location.hash.split("/").pop()}/outputs`;
+    const { positions } = parsePly(await (await fetch(`${folder}/ply/0/cameras.ply`)).arrayBuffer());
+    const lines = (await (await fetch(`${folder}/sparse/0/images.txt`)).text()).split("\n").filter((line) => !line.startsWith("#"));
+    // Every other line is an image: id, quaternion w x y z, translation, camera, name. The centre is -R^T t.
+    const centres = lines.filter((line, k) => k % 2 === 0 && line !== "").map((line) => {
+      const words = line.split(" ");
+      const [w, x, y, z, a, b, c] = words.slice(1, 8).map(Number);
+      const transposed = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+      ];
+      return { name: words.slice(9).join(" "), centre: transposed.map((row) => -(row[0] * a + row[1] * b + row[2] * c)) };
+    });
+    centres.sort((p, q) => (p.name < q.name ? -1 : 1));
+    return [centres.map(({ centre }) => centre), centres.map((_, k) => [...positions.slice(15 * k, 15 * k + 3)])];
+  });
+  assert.equal(named.length, pictures);
+  named.forEach((centre, k) => centre.forEach((value, axis) => assert.ok(Math.abs(value - ordered[k][axis]) < 1e-4 * (1 + Math.abs(value)), `camera ${k}`)));
   assert.deepEqual(errors, []);
   await page.close();
 });

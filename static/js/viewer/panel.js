@@ -10,6 +10,8 @@ import { Stage } from "./stage.js";
 const KEY_TURN = Math.PI / 24;
 /** Vertices of a frustum in cameras.ply: the centre and four corners. */
 const FRUSTUM_VERTICES = 5;
+/** Point sizes to start with, in pixels: sparse clouds need larger points to be read as surfaces. */
+const startSize = (points) => (points < 100_000 ? 3 : points < 1_000_000 ? 2 : 1.5);
 /** A press that moves farther than this many pixels turns the model and chooses nothing. */
 const CLICK_PX = 4;
 
@@ -41,6 +43,7 @@ export function modelViewer(job) {
   let shown = null;
   let registered = null;
   let pressed = null;
+  let sized = false;
 
   const say = (text) => {
     overlay.hidden = text === null;
@@ -78,6 +81,8 @@ export function modelViewer(job) {
           return null;
         }),
       ]);
+      if (!sized) size.value = String(startSize(cloud.positions.length / 3));
+      stage.setPointSize(Number(size.value));
       stage.show(cloud, frusta);
       shown = { model, cameras: (frusta?.positions.length ?? 0) / 3 / FRUSTUM_VERTICES };
       label.hidden = true;
@@ -92,7 +97,10 @@ export function modelViewer(job) {
     }
   }
 
-  size.addEventListener("input", () => stage?.setPointSize(Number(size.value)));
+  size.addEventListener("input", () => {
+    sized = true;
+    stage?.setPointSize(Number(size.value));
+  });
   cameras.addEventListener("change", () => stage?.showCameras(cameras.checked));
   up.addEventListener("change", () => stage?.setUp(up.value));
   choice.addEventListener("change", () => stage && load(job.models.find((model) => model.id === Number(choice.value))));

@@ -4,8 +4,12 @@
 const FOV_DEG = 50;
 /** Points looked at to find where the model is. */
 const FIT_SAMPLE = 20000;
-/** Share of the points on either side that may lie outside the view: stray points far off must not shrink the model. */
-const FIT_TAIL = 0.04;
+/** Share of the points that must be in view: a distant background must not shrink the object ... */
+const FIT_SHARE = 0.75;
+/** ... and the room around them, as a factor. */
+const FIT_MARGIN = 1.3;
+/** How far above the ground the view starts: as the cameras, within limits; `usual` where they stand all round. */
+const FIT_ELEVATION_RAD = { lowest: 0.15, usual: 0.35, highest: 1.1 };
 
 const VERTEX = `
   attribute vec3 tint;
@@ -134,29 +138,31 @@ export class Stage {
     this.fit();
   }
 
-  /** Brings the model into view, looked at from where the pictures were taken and a little above. */
+  /** Brings the model into view, looked at from behind the cameras that took it. */
   fit() {
     if (!this.cloud) return;
     const { three } = this;
     this.model.updateMatrixWorld(true);
-    const middle = robustBox(this.cloud.positions, FIT_TAIL);
-    const centre = new three.Vector3(...middle.centre).applyMatrix4(this.model.matrixWorld);
-    let radius = middle.radius;
-    const toward = new three.Vector3(0.6, 0, 1);
-    if (this.cameras && this.cameras.positions.length > 0) {
-      const around = robustBox(this.cameras.positions, 0);
-      const from = new three.Vector3(...around.centre).applyMatrix4(this.model.matrixWorld).sub(centre);
-      from.y = 0;
-      // Cameras all round the object have their middle near its own: then any side is as good.
-      if (from.length() > 0.2 * radius) toward.copy(from.normalize());
-      radius = Math.max(radius, Math.min(1.6 * radius, 0.6 * around.radius));
-    }
-    toward.normalize();
-    toward.y = 0.4;
-    toward.normalize();
-    const half = (FOV_DEG * Math.PI) / 360;
+    const { middle, reach } = bulkOf(this.cloud.positions);
+    const centre = new three.Vector3(...middle).applyMatrix4(this.model.matrixWorld);
     const narrow = Math.min(1, this.camera.aspect);
-    const distance = (0.95 * radius) / (Math.sin(half) * narrow);
+    let distance = (FIT_MARGIN * reach) / (Math.sin((FOV_DEG * Math.PI) / 360) * narrow);
+    const toward = new three.Vector3(0.6, 0, 1);
+    let elevation = FIT_ELEVATION_RAD.usual;
+    if (this.cameras && this.cameras.positions.length > 0) {
+      const cameras = bulkOf(this.cameras.positions);
+      const from = new three.Vector3(...cameras.middle).applyMatrix4(this.model.matrixWorld).sub(centre);
+      // Cameras all round the object have their middle near its own: then any side is as good.
+      if (from.length() > 0.6 * cameras.reach) {
+        const { lowest, highest } = FIT_ELEVATION_RAD;
+        elevation = Math.min(highest, Math.max(lowest, Math.atan2(from.y, Math.hypot(from.x, from.z))));
+        if (Math.hypot(from.x, from.z) > 0.05 * from.length()) toward.set(from.x, 0, from.z);
+      }
+      // From behind the cameras they are in view themselves, unless that would leave the model small.
+      distance = Math.max(distance, Math.min(1.3 * (from.length() + 0.5 * cameras.reach), 2 * distance));
+    }
+    toward.normalize().multiplyScalar(Math.cos(elevation));
+    toward.y = Math.sin(elevation);
     this.camera.near = distance / 500;
     this.camera.far = distance * 200;
     this.camera.position.copy(centre).addScaledVector(toward, distance);
@@ -251,20 +257,14 @@ export class Stage {
   }
 }
 
-/** Centre and radius of a box that leaves out the given share of the points on either side of each axis. */
-function robustBox(positions, tail) {
+/** Where most of the positions are: the median of each axis, and the distance from there within which `FIT_SHARE` of them lie. */
+function bulkOf(positions) {
   const count = positions.length / 3;
   const step = Math.max(1, Math.floor(count / FIT_SAMPLE));
-  const centre = [0, 0, 0];
-  let sum = 0;
-  for (let axis = 0; axis < 3; axis += 1) {
-    const values = [];
-    for (let i = 0; i < count; i += step) values.push(positions[3 * i + axis]);
-    values.sort((a, b) => a - b);
-    const low = values[Math.floor(tail * (values.length - 1))] ?? 0;
-    const high = values[Math.ceil((1 - tail) * (values.length - 1))] ?? 0;
-    centre[axis] = (low + high) / 2;
-    sum += ((high - low) / 2) ** 2;
-  }
-  return { centre, radius: Math.max(Math.sqrt(sum), 1e-9) };
+  const sample = [];
+  for (let i = 0; i < count; i += step) sample.push(3 * i);
+  const quantile = (values, share) => values.sort((a, b) => a - b)[Math.floor(share * (values.length - 1))];
+  const middle = [0, 1, 2].map((axis) => quantile(sample.map((at) => positions[at + axis]), 0.5));
+  const reach = quantile(sample.map((at) => Math.hypot(...middle.map((m, axis) => positions[at + axis] - m))), FIT_SHARE);
+  return { middle, reach: Math.max(reach, 1e-9) };
 }
