@@ -181,7 +181,7 @@ impl Drop for Program {
 }
 
 fn real_photographs() -> Option<Vec<(String, Vec<u8>)>> {
-    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/datasets/bundler-et/images");
+    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/datasets/strecha-fountain-p11/images");
     let mut found: Vec<_> = std::fs::read_dir(&folder)
         .ok()?
         .map(|entry| entry.unwrap().path())
@@ -193,7 +193,7 @@ fn real_photographs() -> Option<Vec<(String, Vec<u8>)>> {
 }
 
 async fn submit(program: &Program, photographs: &[(String, Vec<u8>)]) -> String {
-    let options = json!({"intake": {"max_long_side_px": 640}}).to_string();
+    let options = json!({"intake": {"max_long_side_px": 2400}}).to_string();
     let form =
         photographs.iter().fold(reqwest::multipart::Form::new().text("options", options), |form, (name, bytes)| {
             form.part("images", file(name, bytes))

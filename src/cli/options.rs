@@ -61,10 +61,7 @@ fn put(options: &mut Value, defaults: &Value, name: &str, value: Value) -> Resul
     for part in name.split('.') {
         let Some(below) = known.get(part) else {
             let names: Vec<&str> = known.as_object().into_iter().flat_map(Map::keys).map(String::as_str).collect();
-            return Err(match &names[..] {
-                [] => format!("option {name}: there is nothing below `{}`", name.trim_end_matches(&format!(".{part}"))),
-                names => format!("option {name}: there is no `{part}`, but {}", names.join(", ")),
-            });
+            return Err(format!("option {name}: there is no `{part}`, but {}", names.join(", ")));
         };
         known = below;
         place = place.get_mut(part).ok_or_else(|| format!("option {name}: it is set in two ways"))?;
@@ -118,7 +115,7 @@ mod tests {
             sets(&["inner.ration=1"]).unwrap_err(),
             "option inner.ration: there is no `ration`, but name, ratio"
         );
-        assert_eq!(sets(&["rounds.x=1"]).unwrap_err(), "option rounds.x: there is nothing below `rounds`");
+        assert_eq!(sets(&["rounds.x=1"]).unwrap_err(), "option rounds: invalid type: map, expected u32");
         let message = sets(&["inner.ratio=wide"]).unwrap_err();
         assert!(message.starts_with("option inner.ratio: invalid type: string \"wide\""), "{message}");
         assert!(merged::<Outer>(Some(json!([1])), &[]).is_err());
