@@ -21,6 +21,9 @@ pub struct IntrinsicsOptions {
     pub min_model_images_for_distortion: usize,
     /// Images sharing a camera before its principal point is freed.
     pub min_images_for_principal_point: usize,
+    /// Whether the principal point is freed of a camera whose pictures carry their EXIF focal length, too. Such pictures are
+    /// whole, and the axis of a lens meets the sensor near its middle; pictures without EXIF may be crops.
+    pub principal_point_despite_exif: bool,
     /// Images sharing a camera before it gets two radial coefficients.
     pub min_images_for_radial: usize,
     /// Images sharing a camera before it gets two focal lengths and tangential distortion as well; null never. Tangential
@@ -37,6 +40,7 @@ impl Default for IntrinsicsOptions {
             min_model_images_for_focal: 3,
             min_model_images_for_distortion: 4,
             min_images_for_principal_point: 8,
+            principal_point_despite_exif: false,
             min_images_for_radial: 4,
             min_images_for_opencv: None,
             refine: true,
@@ -54,7 +58,8 @@ pub fn free_intrinsics(model: &Reconstruction, options: &IntrinsicsOptions) -> B
         FreeIntrinsics {
             focal: images >= options.min_model_images_for_focal,
             distortion: images >= options.min_model_images_for_distortion,
-            principal_point: sharing >= options.min_images_for_principal_point,
+            principal_point: sharing >= options.min_images_for_principal_point
+                && (options.principal_point_despite_exif || model.cameras[&id].focal_source != FocalSource::Exif),
         }
     };
     sharing(model).into_iter().map(|(id, sharing)| (id, free(id, sharing))).collect()
