@@ -193,7 +193,7 @@ fn real_photographs() -> Option<Vec<(String, Vec<u8>)>> {
 }
 
 async fn submit(program: &Program, photographs: &[(String, Vec<u8>)]) -> String {
-    let options = json!({"intake": {"max_long_side_px": 2400}}).to_string();
+    let options = json!({"intake": {"max_long_side_px": 3200}}).to_string();
     let form =
         photographs.iter().fold(reqwest::multipart::Form::new().text("options", options), |form, (name, bytes)| {
             form.part("images", file(name, bytes))
