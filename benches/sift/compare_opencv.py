@@ -43,7 +43,7 @@ def ours(image, args, _):
 
 
 def opencv(image, args, count):
-    sift = cv2.SIFT_create(nfeatures=0 if args.by_scale else count, contrastThreshold=0.02, enable_precise_upscale=True)
+    sift = cv2.SIFT_create(nfeatures=0 if args.by_scale else count, contrastThreshold=args.contrast, enable_precise_upscale=True)
     start = time.process_time()
     found, descriptors = sift.detectAndCompute(image, None)
     seconds = time.process_time() - start
@@ -182,6 +182,7 @@ def main():
     parser.add_argument("--features", type=int, default=0)
     parser.add_argument("--side", type=int, default=1200)
     parser.add_argument("--tolerance", type=float, default=1.5)
+    parser.add_argument("--contrast", type=float, default=0.006, help="contrast threshold of OpenCV; ours is 0.006 / 3")
     parser.add_argument("--by-scale", action="store_true", help="OpenCV's features of the largest scale, too")
     parser.add_argument("--colmap", action="store_true")
     args = parser.parse_args()

@@ -1,6 +1,7 @@
 //! Extracts SIFT features of one image and writes them as binary, for `compare_opencv.py`.
 //!
-//! Usage: sift_extract IMAGE OUT [--max N] [--first-octave N] [--peak X]. OUT holds a little-endian u32 count, then x, y, scale,
+//! Usage: sift_extract IMAGE OUT [--max N] [--first-octave N] [--peak X] [--edge X] [--sigma0 X]
+//! [--camera-sigma X]. OUT holds a little-endian u32 count, then x, y, scale,
 //! orientation as f32 for each keypoint, then 128 bytes each. CPU seconds of the extraction alone go to standard output.
 
 use std::io::Write;
@@ -21,9 +22,15 @@ fn main() -> anyhow::Result<()> {
     for flag in flags.chunks(2) {
         let [name, value] = flag else { anyhow::bail!("{} needs a value", flag[0]) };
         match name.as_str() {
-            "--max" => options.max_features = value.parse()?,
+            "--max" => {
+                options.max_features = value.parse()?;
+                options.small_image_features = options.max_features;
+            }
             "--first-octave" => options.first_octave = value.parse()?,
             "--peak" => options.peak_threshold = value.parse()?,
+            "--edge" => options.edge_threshold = value.parse()?,
+            "--sigma0" => options.sigma0 = value.parse()?,
+            "--camera-sigma" => options.camera_sigma_px = value.parse()?,
             _ => anyhow::bail!("unknown flag {name}"),
         }
     }

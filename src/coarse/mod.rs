@@ -11,7 +11,7 @@ pub mod selection;
 mod tracks;
 
 pub use filter::{KeepLimits, filter};
-pub use intrinsics::{IntrinsicsOptions, free_intrinsics};
+pub use intrinsics::{IntrinsicsOptions, PrincipalPoint, free_intrinsics};
 pub use mapper::{CoarseModels, MapperImage, MapperInput, MapperOptions, Unregistered, reconstruct};
 pub use match_graph::MatchGraph;
 pub use tracks::Tracks;

@@ -39,7 +39,7 @@ use source::Source;
 /// Smallest side of an octave in its own pixels; below it no extremum has a neighbourhood worth describing.
 const MIN_OCTAVE_SIDE: usize = 8;
 
-/// The SIFT features of an image, at most `options.max_features` and those of the largest scales.
+/// The SIFT features of an image, at most [`SiftOptions::limit`] and those of the largest scales.
 ///
 /// Images too small to hold a keypoint give no features. The result depends on nothing but the input and the machine's
 /// instruction set.
@@ -48,8 +48,9 @@ pub fn extract(image: &GrayImage, options: &SiftOptions) -> Features {
 }
 
 fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions) -> Features {
-    let mut collector = Collector::new(options.max_features);
-    if image.width == 0 || image.height == 0 || options.max_features == 0 {
+    let limit = options.limit(image.width, image.height);
+    let mut collector = Collector::new(limit);
+    if image.width == 0 || image.height == 0 || limit == 0 {
         return collector.finish();
     }
     let mut octave_index = 0;

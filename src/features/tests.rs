@@ -215,6 +215,15 @@ fn output_is_sorted_capped_and_repeatable() {
 }
 
 #[test]
+fn the_limit_grows_with_the_image_between_bounds() {
+    let options = SiftOptions::default();
+    assert_eq!(options.limit(640, 480), 12_000);
+    assert_eq!(options.limit(1000, 1500), 16_500);
+    assert_eq!(options.limit(4000, 3000), 26_624);
+    assert_eq!(SiftOptions { max_features: 100, ..options }.limit(640, 480), 100);
+}
+
+#[test]
 fn default_options_are_valid() {
     let mut errors = Vec::new();
     SiftOptions::default().validate(&mut errors);

@@ -1,6 +1,6 @@
 //! Fills in the report of a run.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::features::ImageFeatures;
 use super::intake::Intake;
@@ -8,8 +8,9 @@ use super::measure::{Stopwatch, peak_rss_bytes};
 use super::options::ReconstructionOptions;
 use super::state::{ModelState, PipelineState, mean_and_median};
 use super::{Context, verdict};
+use crate::camera::FocalSource;
 use crate::formats::report::{InputSummary, ModelReport, Report, Software, StageReport};
-use crate::scene::ImageId;
+use crate::scene::{CameraId, ImageId};
 
 /// The report of a finished run.
 #[expect(clippy::too_many_arguments, reason = "a report gathers everything a run knows")]
@@ -39,6 +40,32 @@ pub fn build(
         notes,
     }
 }
+
+/// Tells of principal points found so far from the middle that programs which hold them there disagree with the model. `models`
+/// are in their final order.
+pub fn principal_point_notes(models: &[ModelState]) -> Vec<String> {
+    let cameras = models.iter().enumerate().flat_map(|(at, account)| {
+        let used: BTreeSet<CameraId> = account.model.images().values().map(|image| image.camera).collect();
+        used.into_iter().map(move |id| (at, &account.model.cameras[&id]))
+    });
+    let notes = cameras.filter(|(_, camera)| camera.focal_source != FocalSource::Known).filter_map(|(at, camera)| {
+        let center = camera.principal_point().0;
+        let (dx, dy) = (center.x - 0.5 * f64::from(camera.width), center.y - 0.5 * f64::from(camera.height));
+        let turn_deg = (dx.hypot(dy) / camera.mean_focal_px()).atan().to_degrees();
+        (turn_deg > NOTED_TURN_DEG).then(|| {
+            format!(
+                "Model {at}: the principal point of the {} x {} camera was found {dx:+.1}, {dy:+.1} pixels from the middle of the \
+                 picture. Programs that hold it in the middle turn every camera by {turn_deg:.2} degrees against this model; \
+                 the option coarse.mapper.intrinsics.principal_point = \"middle\" does so here, too.",
+                camera.width, camera.height
+            )
+        })
+    });
+    notes.collect()
+}
+
+/// A principal point that far from the middle, seen as an angle, is worth a note.
+const NOTED_TURN_DEG: f64 = 0.25;
 
 fn model_report(id: usize, ModelState { model, history, .. }: &ModelState) -> ModelReport {
     let (mean, median) = mean_and_median(model.reprojection_errors_px());

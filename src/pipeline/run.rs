@@ -213,7 +213,7 @@ impl Pipeline<'_> {
         intake: &Intake,
         found: &BTreeMap<ImageId, ImageFeatures>,
         mut state: PipelineState,
-        notes: Vec<String>,
+        mut notes: Vec<String>,
     ) -> Result<Report, PipelineError> {
         let orientation: BTreeMap<ImageId, u8> =
             intake.photographs().filter_map(|(id, _, photograph)| Some((id, photograph.exif.orientation?))).collect();
@@ -240,6 +240,7 @@ impl Pipeline<'_> {
             })?;
             (exported.unwrap_or_default(), thumbnails)
         };
+        notes.extend(report::principal_point_notes(&state.models));
         let report = report::build(self.options, self.context, intake, found, &state, runner.stages, notes, &watch);
         export::write_reports(self.paths, &report, &state, intake, &thumbnails)?;
         Ok(report)
