@@ -43,10 +43,10 @@ fn nested(name: &str, value: Value) -> Value {
 }
 
 /// The single options that `change` sets. What is an object without entries in the defaults, such as a table by file name,
-/// is one option.
+/// is one option, and so is one tagged with its kind, such as a loss: another kind has other entries.
 fn leaves(change: &Value, defaults: &Value, prefix: &str, found: &mut Vec<(String, Value)>) {
     match (change, defaults) {
-        (Value::Object(entries), Value::Object(known)) if !known.is_empty() => {
+        (Value::Object(entries), Value::Object(known)) if !known.is_empty() && !known.contains_key("kind") => {
             for (name, value) in entries {
                 let full = if prefix.is_empty() { name.clone() } else { format!("{prefix}.{name}") };
                 leaves(value, known.get(name).unwrap_or(&Value::Null), &full, found);
@@ -84,6 +84,17 @@ mod tests {
         inner: Inner,
         cameras: BTreeMap<String, f64>,
         known: Option<Inner>,
+        loss: Loss,
+    }
+
+    #[derive(Debug, PartialEq, Serialize, Deserialize, Default)]
+    #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+    enum Loss {
+        #[default]
+        Trivial,
+        Huber {
+            scale: f64,
+        },
     }
 
     #[derive(Debug, PartialEq, Serialize, Deserialize, Default)]
@@ -106,6 +117,16 @@ mod tests {
         assert_eq!(options.cameras["a.jpg"], 2.0);
         assert_eq!(options.known, Some(Inner { ratio: 3.0, name: String::new() }));
         assert_eq!(sets(&[]).unwrap(), Outer::default());
+    }
+
+    #[test]
+    fn a_tagged_value_is_set_as_a_whole() {
+        let options = sets(&[r#"loss={"kind": "huber", "scale": 2.0}"#]).unwrap();
+        assert_eq!(options.loss, Loss::Huber { scale: 2.0 });
+        let file = json!({"loss": {"kind": "huber", "scale": 3.0}});
+        assert_eq!(merged::<Outer>(Some(file), &[]).unwrap().loss, Loss::Huber { scale: 3.0 });
+        let message = sets(&["loss.kind=huber"]).unwrap_err();
+        assert!(message.starts_with("option loss: missing field `scale`"), "{message}");
     }
 
     #[test]
