@@ -1,4 +1,4 @@
-//! Separable Gaussian blur of one row: first down the columns of the source rows around it, then along the result.
+//! Separable Gaussian blur of a few rows: first down the columns of the source rows around them, then along the result.
 //! Beyond the border the image goes on with its outermost pixels.
 
 use super::ring::{BLOCK, Ring, padded};
@@ -11,7 +11,12 @@ const CUTOFF_SIGMAS: f32 = 4.0;
 pub(super) struct Kernel {
     /// The weight of the centre, then of its neighbours outwards.
     weights: Vec<f32>,
+    /// All weights from one end to the other, between [`BATCH`] - 1 zeros at either side.
+    spread: Vec<f32>,
 }
+
+/// Rows made together.
+pub(super) const BATCH: usize = 4;
 
 impl Kernel {
     /// The kernel of this sigma in pixels.
@@ -19,7 +24,10 @@ impl Kernel {
         let radius = (CUTOFF_SIGMAS * sigma).ceil().max(1.0) as usize;
         let weight = |k: usize| (-0.5 * (k as f64 / f64::from(sigma)).powi(2)).exp();
         let sum = weight(0) + 2.0 * (1..=radius).map(weight).sum::<f64>();
-        Self { weights: (0..=radius).map(|k| (weight(k) / sum) as f32).collect() }
+        let weights: Vec<f32> = (0..=radius).map(|k| (weight(k) / sum) as f32).collect();
+        let rim = [0.0; BATCH - 1];
+        let spread = rim.into_iter().chain(weights[1..].iter().rev().chain(&weights).copied()).chain(rim).collect();
+        Self { weights, spread }
     }
 
     /// Pixels that it reaches to either side.
@@ -30,33 +38,44 @@ impl Kernel {
 
 /// Buffers of a blur over rows of one width.
 pub(super) struct Scratch {
-    columns: Vec<f32>,
+    columns: [Vec<f32>; BATCH],
 }
 
 impl Scratch {
     /// For rows of `width` values and kernels up to `radius`.
     pub(super) fn new(width: usize, radius: usize) -> Self {
-        Self { columns: vec![0.0; padded(width) + 2 * radius] }
+        Self { columns: std::array::from_fn(|_| vec![0.0; padded(width) + 2 * radius]) }
     }
 }
 
-/// Writes row `y` of the blurred image to `out`; `source` must hold the rows around it, as far as they exist.
-pub(super) fn blur_row(
+/// Writes rows `y..` of the blurred image to `outs`, at most [`BATCH`] of them; `source` must hold the rows around them, as
+/// far as they exist.
+///
+/// Down the columns, the rows of a wide image do not fit the first-level cache, and one output row alone would be limited by
+/// the second level's bandwidth: `2 radius + 1` loads for as many multiplications. So each value loaded serves `BATCH` output
+/// rows, whose sums stay in registers, and arithmetic is the limit.
+pub(super) fn blur_rows(
     isa: Isa,
     kernel: &Kernel,
     source: &Ring,
     (width, height): (usize, usize),
     y: usize,
     scratch: &mut Scratch,
-    out: &mut [f32],
+    outs: &mut [&mut [f32]],
 ) {
     let radius = kernel.radius();
-    let pairs: Vec<(&[f32], &[f32])> =
-        (1..=radius).map(|k| (source.row(y.saturating_sub(k)), source.row((y + k).min(height - 1)))).collect();
-    let columns = &mut scratch.columns[..padded(width) + 2 * radius];
-    blur_columns(isa, &kernel.weights, source.row(y), &pairs, &mut columns[radius..radius + padded(width)]);
-    extend_border(columns, radius, width);
-    blur_along(isa, &kernel.weights, columns, out);
+    let around: Vec<&[f32]> =
+        (0..2 * radius + outs.len()).map(|at| source.row((y + at).saturating_sub(radius).min(height - 1))).collect();
+    let stride = padded(width) + 2 * radius;
+    let mut columns: [&mut [f32]; BATCH] = scratch.columns.each_mut().map(|columns| &mut columns[..stride]);
+    {
+        let targets = columns.each_mut().map(|columns| &mut columns[radius..radius + padded(width)]);
+        blur_columns(isa, &kernel.spread, &around, targets);
+    }
+    for (columns, out) in columns.iter_mut().zip(outs) {
+        extend_border(columns, radius, width);
+        blur_along(isa, &kernel.weights, columns, out);
+    }
 }
 
 /// Repeats the outermost of the `width` values that start at `margin` over all before and after them.
@@ -67,25 +86,36 @@ pub(super) fn extend_border(values: &mut [f32], margin: usize, width: usize) {
 }
 
 stamp!(
-    /// Weighted sum of a row and the pairs of rows around it.
-    blur_columns => blur_columns_body(weights: &[f32], center: &[f32], pairs: &[(&[f32], &[f32])], out: &mut [f32])
+    /// Weighted sums of the rows `around` each of the rows `outs`; `weights` has [`BATCH`] - 1 zeros before and after.
+    blur_columns => blur_columns_body(weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH])
 );
 
 #[inline(always)]
-fn blur_columns_body<const FMA: bool>(weights: &[f32], center: &[f32], pairs: &[(&[f32], &[f32])], out: &mut [f32]) {
-    for (block, out) in out.chunks_exact_mut(BLOCK).enumerate() {
-        let span = block * BLOCK..(block + 1) * BLOCK;
-        let mut sum = [0.0_f32; BLOCK];
-        for (sum, value) in sum.iter_mut().zip(&center[span.clone()]) {
-            *sum = weights[0] * value;
-        }
-        for (&weight, (above, below)) in weights[1..].iter().zip(pairs) {
-            let (above, below) = (&above[span.clone()], &below[span.clone()]);
+fn blur_columns_body<const FMA: bool>(weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH]) {
+    let [out_0, out_1, out_2, out_3] = outs;
+    for start in (0..out_0.len()).step_by(BLOCK) {
+        // Four arrays by name, not an array of arrays: the compiler keeps only these in registers.
+        let (mut sum_0, mut sum_1) = ([0.0_f32; BLOCK], [0.0_f32; BLOCK]);
+        let (mut sum_2, mut sum_3) = ([0.0_f32; BLOCK], [0.0_f32; BLOCK]);
+        for (row, weights) in around.iter().zip(weights.windows(BATCH)) {
+            let row = &row[start..start + BLOCK];
             for i in 0..BLOCK {
-                sum[i] = mul_add::<FMA>(weight, above[i] + below[i], sum[i]);
+                sum_0[i] = mul_add::<FMA>(weights[3], row[i], sum_0[i]);
+            }
+            for i in 0..BLOCK {
+                sum_1[i] = mul_add::<FMA>(weights[2], row[i], sum_1[i]);
+            }
+            for i in 0..BLOCK {
+                sum_2[i] = mul_add::<FMA>(weights[1], row[i], sum_2[i]);
+            }
+            for i in 0..BLOCK {
+                sum_3[i] = mul_add::<FMA>(weights[0], row[i], sum_3[i]);
             }
         }
-        out.copy_from_slice(&sum);
+        out_0[start..start + BLOCK].copy_from_slice(&sum_0);
+        out_1[start..start + BLOCK].copy_from_slice(&sum_1);
+        out_2[start..start + BLOCK].copy_from_slice(&sum_2);
+        out_3[start..start + BLOCK].copy_from_slice(&sum_3);
     }
 }
 

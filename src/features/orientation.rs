@@ -2,9 +2,9 @@
 
 use std::f32::consts::TAU;
 
-use super::gradient::Patch;
+use super::gradient::{LANES, Patch};
 use super::ring::Ring;
-use super::simd::Isa;
+use super::simd::{Isa, stamp, whole_number};
 
 /// Bins of the histogram over the full turn.
 const BINS: usize = 36;
@@ -14,6 +14,8 @@ const WINDOW_SIGMAS: f32 = 1.5;
 const CUTOFF: f32 = 3.0;
 /// Peaks of at least this part of the highest give further orientations.
 const PEAK_PART: f32 = 0.8;
+/// Histograms that pixels are added to in turn, so that none waits for the sum before it.
+const COPIES: usize = 4;
 /// Passes of the smoothing filter (1 4 6 4 1) / 16 over the histogram.
 const SMOOTHINGS: usize = 1;
 
@@ -30,8 +32,7 @@ pub(super) fn find(
     let window = WINDOW_SIGMAS * sigma;
     let radius = CUTOFF * window;
     let falloff = -0.5 / (window * window);
-    // One bin more takes what the last shares with the first.
-    let mut histogram = [0.0_f32; BINS + 1];
+    let mut copies = [[0.0_f32; BINS + 1]; COPIES];
     let (top, bottom) = clip(y, radius, height);
     let (from, to) = clip(x, radius, width);
     patch.set_window(x, falloff, from, to);
@@ -43,12 +44,12 @@ pub(super) fn find(
             continue;
         }
         patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
-        for (weight, direction) in patch.weight.iter().zip(&patch.direction).take(right - left) {
-            let place = direction * (BINS as f32 / TAU);
-            let bin = (place as usize).min(BINS - 1);
-            let part = weight * (place - bin as f32);
-            histogram[bin] += weight - part;
-            histogram[bin + 1] += part;
+        add_to_histograms(isa, &patch.weight[..right - left], &patch.direction[..right - left], &mut copies);
+    }
+    let mut histogram = [0.0_f32; BINS + 1];
+    for copy in &copies {
+        for (sum, value) in histogram.iter_mut().zip(copy) {
+            *sum += value;
         }
     }
     histogram[0] += histogram[BINS];
@@ -62,10 +63,41 @@ pub(super) fn find(
     peaks(&histogram, most)
 }
 
+stamp!(
+    /// Shares each weight between the two bins nearest to its direction; the bin after the last takes what that shares with
+    /// the first.
+    add_to_histograms => add_to_histograms_body(
+        weight: &[f32], direction: &[f32], copies: &mut [[f32; BINS + 1]; COPIES],
+    )
+);
+
+#[inline(always)]
+fn add_to_histograms_body<const FMA: bool>(weight: &[f32], direction: &[f32], copies: &mut [[f32; BINS + 1]; COPIES]) {
+    for (weights, directions) in weight.chunks(LANES).zip(direction.chunks(LANES)) {
+        let (mut first, mut part) = ([0_u32; LANES], [0.0_f32; LANES]);
+        for (i, direction) in directions.iter().enumerate() {
+            let place = direction * (BINS as f32 / TAU);
+            let bin = place.trunc().min((BINS - 1) as f32);
+            part[i] = place - bin;
+            first[i] = whole_number(bin);
+        }
+        for (i, &weight) in weights.iter().enumerate() {
+            let (histogram, bin) = (&mut copies[i % COPIES], (first[i] as usize).min(BINS - 1));
+            let above = weight * part[i];
+            histogram[bin] += weight - above;
+            histogram[bin + 1] += above;
+        }
+    }
+}
+
 /// The whole pixels within `radius` of `center` that are not on the border, as a half-open range.
+#[inline]
 pub(super) fn clip(center: f32, radius: f32, length: usize) -> (usize, usize) {
-    let from = (center - radius).ceil().max(1.0) as usize;
-    let to = ((center + radius).floor() + 1.0).clamp(0.0, (length - 1) as f32) as usize;
+    // Without these, `ceil` and `floor` are library calls on the x86-64 baseline, for every row of every keypoint.
+    let above = |value: f32| value as i32 + i32::from((value as i32 as f32) < value);
+    let below = |value: f32| value as i32 - i32::from((value as i32 as f32) > value);
+    let from = above(center - radius).max(1) as usize;
+    let to = (below(center + radius) + 1).clamp(0, length as i32 - 1) as usize;
     (from, to)
 }
 

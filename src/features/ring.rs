@@ -45,6 +45,16 @@ impl Ring {
         &self.data[start..start + length]
     }
 
+    /// Makes room for the next `count` rows (fewer than the capacity) and returns them in order, to be filled.
+    pub(super) fn push_rows(&mut self, count: usize) -> Vec<&mut [f32]> {
+        let first = self.next % self.capacity;
+        self.next += count;
+        let length = self.stride - BLOCK;
+        let (before, from) = self.data.split_at_mut(first * self.stride);
+        let rows = from.chunks_exact_mut(self.stride).chain(before.chunks_exact_mut(self.stride));
+        rows.take(count).map(|row| &mut row[..length]).collect()
+    }
+
     /// Makes room for the next row and returns it, to be filled.
     pub(super) fn push(&mut self) -> &mut [f32] {
         let start = (self.next % self.capacity) * self.stride;

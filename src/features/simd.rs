@@ -49,6 +49,27 @@ pub(super) fn mul_add<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA || cfg!(target_arch = "aarch64") { a.mul_add(b, c) } else { a * b + c }
 }
 
+/// The whole number nearest to a number of [0, 2^22]. Adding 2^23 leaves it in the low bits of the sum; an `as` conversion
+/// checks for values out of range, one lane after the other, and does not vectorise.
+#[inline(always)]
+pub(super) fn whole_number(value: f32) -> u32 {
+    const SHIFT: f32 = 8_388_608.0;
+    (value + SHIFT).to_bits() & 0x7f_ffff
+}
+
+/// Asks for the cache lines of these values, which will be read soon. Does nothing where there is no such instruction.
+#[inline(always)]
+pub(super) fn prefetch(values: &[f32]) {
+    #[cfg(target_arch = "x86_64")]
+    for line in values.chunks(64 / size_of::<f32>()) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: prefetching reads nothing, whatever the address; part of the baseline.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = values;
+}
+
 /// Defines `fn name(isa, arguments)` that runs `body::<FMA>(arguments)` compiled for `isa`.
 macro_rules! stamp {
     ($(#[$doc:meta])* $name:ident => $body:ident ( $($arg:ident : $kind:ty),* $(,)? ) $(-> $out:ty)?) => {

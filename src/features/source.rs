@@ -11,7 +11,7 @@
 //! interpolation and blur at once. Every p lies a quarter pixel from an i, so there are two kernels, mirror images of each
 //! other, and all pixels are equally sharp (linear interpolation blurs by changing amounts).
 
-use super::blur::{Kernel, Scratch, blur_row, extend_border};
+use super::blur::{BATCH, Kernel, Scratch, blur_rows, extend_border};
 use super::octave::Plane;
 use super::options::SiftOptions;
 use super::ring::{BLOCK, Ring, padded};
@@ -40,7 +40,7 @@ impl<'a> Source<'a> {
     pub(super) fn original(image: &'a GrayImage, options: &SiftOptions) -> Self {
         let blur_sq = options.sigma0.powi(2) - options.camera_sigma_px.powi(2);
         let kernel = Kernel::gaussian(blur_sq.sqrt());
-        let rows = Ring::new(image.width, 2 * kernel.radius() + 1);
+        let rows = Ring::new(image.width, 2 * kernel.radius() + BATCH);
         Self { size: (image.width, image.height), kind: Kind::Original { image, kernel, rows } }
     }
 
@@ -86,13 +86,22 @@ impl<'a> Source<'a> {
         }
     }
 
-    /// Writes row `y`; rows are asked for in order.
-    pub(super) fn fill(&mut self, isa: Isa, y: usize, scratch: &mut Scratch, out: &mut [f32]) {
+    /// Writes rows `y..`, at most [`BATCH`] of them; rows are asked for in order.
+    pub(super) fn fill(&mut self, isa: Isa, y: usize, scratch: &mut Scratch, outs: &mut [&mut [f32]]) {
+        if let Kind::Original { image, kernel, rows } = &mut self.kind {
+            read_rows(isa, image, rows, y + outs.len() - 1 + kernel.radius());
+            blur_rows(isa, kernel, rows, self.size, y, scratch, outs);
+            return;
+        }
+        for (y, out) in (y..).zip(outs) {
+            self.fill_row(isa, y, out);
+        }
+    }
+
+    /// Writes row `y` of a source that is not blurred from others.
+    fn fill_row(&mut self, isa: Isa, y: usize, out: &mut [f32]) {
         match &mut self.kind {
-            Kind::Original { image, kernel, rows } => {
-                read_rows(isa, image, rows, y + kernel.radius());
-                blur_row(isa, kernel, rows, self.size, y, scratch, out);
-            }
+            Kind::Original { .. } => {}
             Kind::Doubled { image, taps, rows, columns, scratch } => {
                 let (radius, center) = (taps.len() / 2, y / 2);
                 read_rows(isa, image, rows, center + radius);
