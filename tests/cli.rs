@@ -6,6 +6,8 @@
 mod evaluate;
 #[path = "cli/reconstruct.rs"]
 mod reconstruct;
+#[path = "cli/synthesize.rs"]
+mod synthesize;
 
 use std::process::{Command, Output};
 

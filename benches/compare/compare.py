@@ -9,7 +9,8 @@ Needs `cargo build --release` and a Python with numpy and pycolmap (pip install 
 hints, on the CPU; COLMAP matches exhaustively and maps incrementally. --reuse-colmap takes COLMAP's figures from an earlier
 run where there are any: right for quality, and for time only on a computer that is as busy as it was then.
 
-Time: of our whole process; of COLMAP's three stages without the start of Python. Memory: the largest resident set.
+Time: of our whole process; of COLMAP's three stages without the start of Python. Memory: the largest resident set, as each
+process tells of itself.
 AUC: `multistage evaluate`. Wild: see model_quality.py. Ratios are ours to COLMAP's.
 """
 import argparse
@@ -27,7 +28,7 @@ HEADER = ["set", "program", "wall s", "CPU s", "peak MB", "registered", "AUC@1 /
 
 
 def measured(command, log):
-    """Runs a command with its output in the file `log`: exit status, wall and CPU seconds, peak bytes."""
+    """Runs a command with its output in the file `log`: exit status, wall and CPU seconds."""
     with open(log, "wb") as output:
         start = time.monotonic()
         process = subprocess.Popen([str(part) for part in command], stdout=output, stderr=subprocess.STDOUT)
@@ -37,7 +38,6 @@ def measured(command, log):
         "status": process.returncode,
         "wall_s": time.monotonic() - start,
         "cpu_s": usage.ru_utime + usage.ru_stime,
-        "peak_bytes": usage.ru_maxrss * 1024,
     }
 
 
@@ -62,6 +62,7 @@ def run_ours(data, out, arguments):
     if figures["status"] not in (0, 3):
         raise SystemExit(f"{data.name}: multistage failed, see {out / 'log.txt'}")
     report = json.loads((out / "result" / "report.json").read_text())
+    figures["peak_bytes"] = report["peak_rss_bytes"]
     figures["stages"] = [
         {key: stage[key] for key in ("name", "iteration", "wall_s", "cpu_s")} for stage in report["stages"]
     ]

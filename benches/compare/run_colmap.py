@@ -40,7 +40,8 @@ def main():
     timed("features", lambda: pycolmap.extract_features(database, images, extraction_options=extraction, device=cpu))
     timed("matching", lambda: pycolmap.match_exhaustive(database, matching_options=matching, device=cpu))
     timed("mapping", lambda: pycolmap.incremental_mapping(database, images, sparse))
-    print(json.dumps({"version": pycolmap.__version__, "stages": stages}))
+    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    print(json.dumps({"version": pycolmap.__version__, "stages": stages, "peak_bytes": peak_bytes}))
 
 
 if __name__ == "__main__":

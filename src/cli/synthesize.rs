@@ -4,20 +4,22 @@ use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use rayon::prelude::*;
 use serde::Deserialize;
 
 use super::Failure;
+use crate::camera::Camera;
 use crate::formats::exif::{self, Exif};
+use crate::formats::features::{FEATURE_SET_INDEX, FeatureSet, FeatureSetImage};
 use crate::formats::{colmap, features, photograph};
 use crate::scene::{CameraId, ImageId, Reconstruction};
-use crate::synthetic::{SceneOptions, Temple, TempleOptions, generate};
+use crate::synthetic::{Photographer, Picture, SceneOptions, Temple, TempleOptions};
 
 /// Arguments of `synthesize`.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "SPEC is `temple` (photographs of a stone temple), `features` (features without pictures), or a JSON file \
-{\"scene\": \"temple\" or \"features\", ...options}. DIR/gt gets the truth: a COLMAP model as text, and poses.txt."
-)]
+#[command(after_help = "SPEC is `temple` (photographs of a stone temple), `features` (features without pictures, for \
+`reconstruct DIR/features --set intake.ready_features=true`), or a JSON file \
+{\"scene\": \"temple\" or \"features\", ...options}. DIR/gt gets the truth: a COLMAP model as text, and poses.txt.")]
 pub(super) struct Args {
     /// What to make: temple, features or a JSON file.
     spec: String,
@@ -88,14 +90,7 @@ pub(super) fn write_temple(
     fs::create_dir_all(&images)?;
     let temple = Temple::new(options);
     let camera = temple.camera();
-    let diagonal_px = f64::from(camera.width).hypot(f64::from(camera.height));
-    let exif = Exif {
-        make: Some("Multistage".to_owned()),
-        model: Some("Ray caster".to_owned()),
-        focal_35mm: Some((camera.mean_focal_px() * FILM_DIAGONAL_MM / diagonal_px).round()),
-        orientation: Some(1),
-        ..Exif::default()
-    };
+    let exif = invented_exif("Ray caster", &camera);
     let mut truth = Reconstruction::new([(CameraId(0), camera)].into());
     let mut names = Vec::new();
     let mut paths = Vec::new();
@@ -115,16 +110,39 @@ pub(super) fn write_temple(
     Ok(paths)
 }
 
-/// Writes the features of every image (`features/NAME.msfeat`) and the truth.
+/// Writes the features of every image as a set that `reconstruct --set intake.ready_features=true` takes, and the truth.
+/// Images are made in parallel and written at once, so memory holds only the truth.
 fn write_features(options: &SceneOptions, out: &Path) -> io::Result<()> {
-    let scene = generate(options);
     let folder = out.join("features");
     fs::create_dir_all(&folder)?;
-    let names: Vec<String> = (0..options.num_images).map(|index| format!("image_{index:03}.jpg")).collect();
-    for (name, found) in names.iter().zip(scene.features.values()) {
-        fs::write(folder.join(name).with_extension("msfeat"), features::to_bytes(found))?;
+    let photographer = Photographer::new(options);
+    let written: Vec<(Picture, FeatureSetImage)> = (0..options.num_images)
+        .into_par_iter()
+        .map(|index| {
+            let (picture, found) = photographer.photograph(index);
+            let name = format!("image_{index:04}.jpg");
+            let file = format!("image_{index:04}.msfeat");
+            fs::write(folder.join(&file), features::to_bytes(&found))?;
+            let exif = invented_exif("Scene", &photographer.cameras()[&picture.camera]);
+            Ok((picture, FeatureSetImage { name, file, width: options.width, height: options.height, exif }))
+        })
+        .collect::<io::Result<_>>()?;
+    let (pictures, images): (Vec<Picture>, Vec<FeatureSetImage>) = written.into_iter().unzip();
+    let names: Vec<String> = images.iter().map(|image| image.name.clone()).collect();
+    fs::write(folder.join(FEATURE_SET_INDEX), serde_json::to_vec_pretty(&FeatureSet { images })?)?;
+    write_truth(&photographer.truth(pictures), &names, &out.join("gt"))
+}
+
+/// What a camera of this program would write into its photographs.
+fn invented_exif(model: &str, camera: &Camera) -> Exif {
+    let diagonal_px = f64::from(camera.width).hypot(f64::from(camera.height));
+    Exif {
+        make: Some("Multistage".to_owned()),
+        model: Some(model.to_owned()),
+        focal_35mm: Some((camera.mean_focal_px() * FILM_DIAGONAL_MM / diagonal_px).round()),
+        orientation: Some(1),
+        ..Exif::default()
     }
-    write_truth(&scene.truth, &names, &out.join("gt"))
 }
 
 /// Writes a model as COLMAP text and as a list of poses; image ids count `names`.

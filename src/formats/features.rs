@@ -2,8 +2,39 @@
 //!
 //! Little-endian: magic `MSFEAT01`, count (u64), `count` keypoints of four f32 (x, y, scale, orientation), `count` descriptors
 //! of 128 bytes. The fixed order lets a reader take the largest scales alone.
+//!
+//! A set of such files is a folder with an [`FEATURE_SET_INDEX`], which says what photographs they stand for.
 
+use serde::{Deserialize, Serialize};
+
+use super::exif::Exif;
 use crate::scene::{DESCRIPTOR_LEN, Features, Keypoint};
+
+/// Name of the index of a set of feature files.
+pub const FEATURE_SET_INDEX: &str = "index.json";
+
+/// A set of feature files that stand for photographs.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct FeatureSet {
+    /// The images, in any order.
+    pub images: Vec<FeatureSetImage>,
+}
+
+/// One image of a set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FeatureSetImage {
+    /// Name of the photograph.
+    pub name: String,
+    /// Path of its feature file, relative to the index.
+    pub file: String,
+    /// Columns of the photograph.
+    pub width: u32,
+    /// Rows of the photograph.
+    pub height: u32,
+    /// What is known of how it was taken.
+    #[serde(default)]
+    pub exif: Exif,
+}
 
 const MAGIC: &[u8; 8] = b"MSFEAT01";
 const HEADER_LEN: usize = 16;
@@ -23,6 +54,9 @@ pub enum FeatureFileError {
         /// Its length in bytes.
         actual: usize,
     },
+    /// Its features are not in order of descending scale, or are no numbers.
+    #[error("feature {0} is out of order or no number: features are sorted by descending scale")]
+    OutOfOrder(usize),
 }
 
 /// The file of these features.
@@ -69,6 +103,22 @@ pub fn from_bytes(bytes: &[u8], limit: Option<usize>) -> Result<Features, Featur
     Ok(Features { keypoints: keypoints.collect(), descriptors: descriptors[..taken].to_vec() })
 }
 
+/// Checks what readers of features rely on: numbers, by descending scale.
+///
+/// # Errors
+/// [`FeatureFileError::OutOfOrder`] for the first feature that breaks it.
+pub fn check_order(features: &Features) -> Result<(), FeatureFileError> {
+    let mut scale = f32::MAX;
+    for (at, keypoint) in features.keypoints.iter().enumerate() {
+        let finite = [keypoint.x, keypoint.y, keypoint.orientation].iter().all(|value| value.is_finite());
+        if !finite || !(0.0..=scale).contains(&keypoint.scale) {
+            return Err(FeatureFileError::OutOfOrder(at));
+        }
+        scale = keypoint.scale;
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -86,5 +136,12 @@ mod tests {
         assert_eq!(from_bytes(&bytes, Some(2)).unwrap().keypoints, features.keypoints[..2]);
         assert!(from_bytes(&bytes[..bytes.len() - 1], None).is_err());
         assert_eq!(from_bytes(b"MSFEAT02________", None), Err(FeatureFileError::WrongMagic));
+        assert_eq!(check_order(&features), Ok(()));
+        let mut shuffled = features.clone();
+        shuffled.keypoints.swap(1, 3);
+        assert_eq!(check_order(&shuffled), Err(FeatureFileError::OutOfOrder(2)));
+        shuffled = features;
+        shuffled.keypoints[4].x = f32::NAN;
+        assert_eq!(check_order(&shuffled), Err(FeatureFileError::OutOfOrder(4)));
     }
 }

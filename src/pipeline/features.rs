@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::intake::{Intake, Refusal, advice};
 use super::options::ReconstructionOptions;
 use super::runner::{ArtifactKey, Counts, StageProgress, counts, io_error};
-use super::{Context, PipelineError, Stage};
+use super::{Context, PipelineError, Stage, ready_features};
 use crate::features::extract;
 use crate::formats::features as feature_file;
 use crate::formats::photograph::Photograph;
@@ -39,6 +39,12 @@ pub fn run(
     progress: &StageProgress<'_>,
 ) -> Result<(BTreeMap<ImageId, ImageFeatures>, Counts), PipelineError> {
     let photographs: Vec<_> = intake.photographs().collect();
+    let ready: BTreeMap<String, PathBuf> = if options.intake.ready_features {
+        let images = ready_features::index(folder)?;
+        images.into_iter().map(|image| (image.name, folder.join(image.file))).collect()
+    } else {
+        BTreeMap::new()
+    };
     let extracted: Vec<Result<(ImageId, ImageFeatures, bool), PipelineError>> = photographs
         .par_iter()
         .map(|(id, file, _)| {
@@ -50,7 +56,10 @@ pub fn run(
             let reused = stored.is_some();
             let count = match stored {
                 Some(features) => Ok(features.len()),
-                None => match extract_one(&folder.join(&file.name), options)? {
+                None => match ready
+                    .get(&file.name)
+                    .map_or_else(|| extract_one(&folder.join(&file.name), options), |path| ready_features::read(path))?
+                {
                     Ok(features) => {
                         let bytes = feature_file::to_bytes(&features);
                         store.put(&key, &bytes).map_err(|source| io_error(Stage::Features, Path::new(&key), source))?;

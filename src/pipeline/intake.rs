@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::options::{IntakeOptions, KnownCamera};
-use super::{Context, PipelineError};
+use super::{Context, PipelineError, ready_features};
 use crate::camera::{Camera, CameraModel, FocalSource, MAX_PARAMS};
 use crate::formats::exif::Exif;
 use crate::formats::photograph::{self, PhotographError};
@@ -79,6 +79,9 @@ impl Intake {
 /// # Errors
 /// When the folder can't be listed or holds no file that is meant to be a photograph.
 pub fn run(folder: &Path, options: &IntakeOptions, context: &Context) -> Result<Intake, PipelineError> {
+    if options.ready_features {
+        return Ok(group_cameras(refuse_duplicates(ready_features::inspect(folder)?), options));
+    }
     let unusable = |message: String| PipelineError::InvalidInput { path: folder.to_owned(), message };
     let mut names = Vec::new();
     list(folder, folder, &mut names).map_err(|error| unusable(error.to_string()))?;
@@ -86,14 +89,14 @@ pub fn run(folder: &Path, options: &IntakeOptions, context: &Context) -> Result<
     if names.is_empty() {
         return Err(unusable("there is no photograph in it".to_owned()));
     }
-    let inspected: Vec<Result<(InputFile, Option<Exif>), PipelineError>> = names
+    let inspected: Vec<Result<InputFile, PipelineError>> = names
         .par_iter()
         .map(|name| {
             context.check_cancelled()?;
             Ok(inspect(folder, name, options))
         })
         .collect();
-    let inspected: Vec<(InputFile, Option<Exif>)> = inspected.into_iter().collect::<Result<_, _>>()?;
+    let inspected: Vec<InputFile> = inspected.into_iter().collect::<Result<_, _>>()?;
     Ok(group_cameras(refuse_duplicates(inspected), options))
 }
 
@@ -122,10 +125,10 @@ fn list(root: &Path, folder: &Path, names: &mut Vec<String>) -> std::io::Result<
 }
 
 /// Reads the header of one file; its camera is filled in later.
-fn inspect(folder: &Path, name: &str, options: &IntakeOptions) -> (InputFile, Option<Exif>) {
+fn inspect(folder: &Path, name: &str, options: &IntakeOptions) -> InputFile {
     let refused = |sha256: Option<String>, size: Option<(u32, u32)>, code: &str, advice: String| {
         let photograph = Err(Refusal { code: code.to_owned(), advice });
-        (InputFile { name: name.to_owned(), sha256, size, photograph }, None)
+        InputFile { name: name.to_owned(), sha256, size, photograph }
     };
     let path: PathBuf = folder.join(name);
     let bytes = match std::fs::read(&path) {
@@ -137,8 +140,8 @@ fn inspect(folder: &Path, name: &str, options: &IntakeOptions) -> (InputFile, Op
         Ok(info) => {
             let size = Some((info.width, info.height));
             let photograph =
-                Ok(Photograph { width: info.width, height: info.height, camera: CameraId(0), exif: info.exif.clone() });
-            (InputFile { name: name.to_owned(), sha256, size, photograph }, Some(info.exif))
+                Ok(Photograph { width: info.width, height: info.height, camera: CameraId(0), exif: info.exif });
+            InputFile { name: name.to_owned(), sha256, size, photograph }
         }
         Err(error) => refused(sha256, stated_size(&error), error.code(), advice(&error)),
     }
@@ -168,15 +171,15 @@ pub fn advice(error: &PhotographError) -> String {
 }
 
 /// Bytes in hexadecimal.
-fn hex(bytes: &[u8]) -> String {
+pub(super) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Keeps the first of several files with the same bytes.
-fn refuse_duplicates(inspected: Vec<(InputFile, Option<Exif>)>) -> Vec<(InputFile, Option<Exif>)> {
+fn refuse_duplicates(inspected: Vec<InputFile>) -> Vec<InputFile> {
     let mut first: BTreeMap<String, String> = BTreeMap::new();
     let mut kept = Vec::with_capacity(inspected.len());
-    for (mut file, exif) in inspected {
+    for mut file in inspected {
         if let (Ok(_), Some(sha256)) = (&file.photograph, &file.sha256) {
             if let Some(original) = first.get(sha256) {
                 file.photograph = Err(Refusal {
@@ -187,7 +190,7 @@ fn refuse_duplicates(inspected: Vec<(InputFile, Option<Exif>)>) -> Vec<(InputFil
                 first.insert(sha256.clone(), file.name.clone());
             }
         }
-        kept.push((file, exif));
+        kept.push(file);
     }
     kept
 }
@@ -223,11 +226,11 @@ fn camera_key(file: &InputFile, photograph: &Photograph, options: &IntakeOptions
 
 /// Gives every photograph its camera: one for all that agree in make, model, lens, focal length and size, or, without EXIF,
 /// in size (estimates that disagree split such a group later).
-fn group_cameras(inspected: Vec<(InputFile, Option<Exif>)>, options: &IntakeOptions) -> Intake {
+fn group_cameras(inspected: Vec<InputFile>, options: &IntakeOptions) -> Intake {
     let mut ids: BTreeMap<CameraKey, CameraId> = BTreeMap::new();
     let mut cameras = BTreeMap::new();
     let mut files = Vec::with_capacity(inspected.len());
-    for (mut file, _) in inspected {
+    for mut file in inspected {
         if let Ok(photograph) = &file.photograph {
             let key = camera_key(&file, photograph, options);
             let next = CameraId(ids.len() as u32);

@@ -11,6 +11,7 @@ mod intake;
 mod localise;
 mod measure;
 mod options;
+mod ready_features;
 mod refine;
 mod report;
 mod run;

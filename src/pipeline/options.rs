@@ -70,6 +70,9 @@ pub struct IntakeOptions {
     pub camera: Option<KnownCamera>,
     /// Intrinsics known for single pictures, by name; they go before `camera`.
     pub cameras: BTreeMap<String, KnownCamera>,
+    /// Takes a set of ready features (`index.json` and the files it names, as `multistage synthesize` writes them) in place
+    /// of photographs; the options of `features` have no effect then, and points stay black.
+    pub ready_features: bool,
 }
 
 impl Default for IntakeOptions {
@@ -81,6 +84,7 @@ impl Default for IntakeOptions {
             default_focal: 1.2,
             camera: None,
             cameras: BTreeMap::new(),
+            ready_features: false,
         }
     }
 }

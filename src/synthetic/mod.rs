@@ -2,6 +2,7 @@
 
 mod compare;
 mod layout;
+mod photographer;
 mod scene;
 mod temple;
 mod temple_solids;
@@ -9,5 +10,6 @@ mod temple_stone;
 
 pub use compare::{ModelDifference, compare};
 pub use layout::Layout;
+pub use photographer::{Photographer, Picture};
 pub use scene::{PairMatches, SceneOptions, SyntheticScene, generate, perturbed};
 pub use temple::{Temple, TempleOptions};

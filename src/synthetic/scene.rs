@@ -9,13 +9,12 @@ use std::collections::BTreeMap;
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::layout::{Layout, SurfacePoint};
-use crate::camera::{Camera, CameraModel, FocalSource, Pixel};
+use super::layout::Layout;
+use super::photographer::Photographer;
+use crate::camera::CameraModel;
 use crate::geometry::Rigid3;
 use crate::math::Rng;
-use crate::scene::{
-    CameraId, DESCRIPTOR_LEN, Descriptor, Features, ImageId, Keypoint, KeypointIdx, Observation, Reconstruction,
-};
+use crate::scene::{Features, ImageId, KeypointIdx, Reconstruction};
 
 /// What to generate.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -95,7 +94,7 @@ pub struct SyntheticScene {
 /// Streams of the generator.
 #[repr(u64)]
 #[derive(Clone, Copy)]
-enum Stream {
+pub(super) enum Stream {
     Camera = 1,
     Pose,
     Point,
@@ -104,150 +103,26 @@ enum Stream {
     Perturbation,
 }
 
-/// A keypoint before its image's features are sorted.
-struct Sighting {
-    keypoint: Keypoint,
-    pixel: Pixel,
-    descriptor: Descriptor,
-    point: Option<usize>,
-}
-
-/// What all sightings of a point share.
-struct Appearance {
-    surface: SurfacePoint,
-    size: f64,
-    orientation: f32,
-    look: [f64; DESCRIPTOR_LEN],
-    color: [u8; 3],
+impl Stream {
+    /// The generator of item `id`.
+    pub(super) fn rng(self, options: &SceneOptions, id: usize) -> Rng {
+        Rng::from_parts(&[options.seed, self as u64, id as u64])
+    }
 }
 
 /// Generates the scene of these options; always the same one.
 pub fn generate(options: &SceneOptions) -> SyntheticScene {
-    let stream = |stream: Stream, id: usize| Rng::from_parts(&[options.seed, stream as u64, id as u64]);
-    let num_cameras = if options.shared_camera { 1 } else { options.num_images };
-    let cameras = (0..num_cameras).map(|id| {
-        let spread = if options.shared_camera { 0.0 } else { 0.05 };
-        (CameraId(id as u32), camera(options, 1.0 + spread * stream(Stream::Camera, id).range(-1.0, 1.0)))
-    });
-    let mut truth = Reconstruction::new(cameras.collect());
-    let points: Vec<Appearance> =
-        (0..options.num_points).map(|id| appearance(options, &mut stream(Stream::Point, id))).collect();
-
+    let photographer = Photographer::new(options);
     let mut features = BTreeMap::new();
-    let mut tracks = vec![Vec::new(); points.len()];
+    let mut pictures = Vec::with_capacity(options.num_images);
     for index in 0..options.num_images {
-        let id = ImageId(index as u32);
-        let camera = CameraId(if options.shared_camera { 0 } else { index as u32 });
-        let pose = options.layout.pose(index, options.num_images, &mut stream(Stream::Pose, index));
-        let sightings = photograph(options, &truth.cameras[&camera], &pose, &points, &mut stream(Stream::Image, index));
-        for (keypoint, sighting) in (0u32..).map(KeypointIdx).zip(&sightings) {
-            if let Some(point) = sighting.point {
-                tracks[point].push(Observation { image: id, keypoint });
-            }
-        }
-        truth.register(id, camera, pose, sightings.iter().map(|sighting| sighting.pixel).collect());
-        features.insert(
-            id,
-            Features {
-                keypoints: sightings.iter().map(|sighting| sighting.keypoint).collect(),
-                descriptors: sightings.iter().map(|sighting| sighting.descriptor).collect(),
-            },
-        );
+        let (picture, found) = photographer.photograph(index);
+        features.insert(ImageId(index as u32), found);
+        pictures.push(picture);
     }
-    for (point, track) in points.iter().zip(tracks) {
-        if track.len() >= 2 {
-            truth.add_point(point.surface.xyz, track, point.color);
-        }
-    }
-    let matches = matches_of(options, &truth, &mut stream(Stream::Matches, 0));
+    let truth = photographer.truth(pictures);
+    let matches = matches_of(options, &truth, &mut Stream::Matches.rng(options, 0));
     SyntheticScene { truth, features, matches }
-}
-
-fn camera(options: &SceneOptions, focal_factor: f64) -> Camera {
-    let focal_px = options.focal_px * focal_factor;
-    let mut camera =
-        Camera::centered(options.camera_model, options.width, options.height, focal_px, FocalSource::Known);
-    let at = camera.model.distortion_index();
-    let n = camera.model.num_params() - at;
-    camera.params[at..at + n].copy_from_slice(&options.distortion[..n]);
-    camera
-}
-
-fn appearance(options: &SceneOptions, rng: &mut Rng) -> Appearance {
-    let surface = options.layout.point(options.num_images, rng);
-    Appearance {
-        surface,
-        size: 0.01 * (0.5 * rng.normal()).exp(),
-        orientation: rng.range(0.0, std::f64::consts::TAU) as f32,
-        look: random_look(rng),
-        color: std::array::from_fn(|_| rng.below(256) as u8),
-    }
-}
-
-fn random_look(rng: &mut Rng) -> [f64; DESCRIPTOR_LEN] {
-    std::array::from_fn(|_| rng.uniform().powi(4))
-}
-
-/// The quantised RootSIFT descriptor of a look with relative noise.
-fn describe(look: &[f64; DESCRIPTOR_LEN], noise: f64, rng: &mut Rng) -> Descriptor {
-    let noisy: [f64; DESCRIPTOR_LEN] = std::array::from_fn(|i| (look[i] * (1.0 + noise * rng.normal())).max(0.0));
-    let sum: f64 = noisy.iter().sum();
-    std::array::from_fn(|i| (512.0 * (noisy[i] / sum).sqrt()).round().min(255.0) as u8)
-}
-
-/// Everything an image detects, sorted as [`Features`] asks.
-fn photograph(
-    options: &SceneOptions,
-    camera: &Camera,
-    pose: &Rigid3,
-    points: &[Appearance],
-    rng: &mut Rng,
-) -> Vec<Sighting> {
-    let (width, height) = (f64::from(options.width), f64::from(options.height));
-    let center = pose.target_origin_in_source();
-    let mut sightings = Vec::new();
-    for (id, point) in points.iter().enumerate() {
-        let detected = rng.uniform() < options.detection_ratio;
-        let gross = rng.uniform() < options.gross_error_ratio;
-        let error = rng.range(20.0, 100.0);
-        let angle = rng.range(0.0, std::f64::consts::TAU);
-        let noise = nalgebra::Vector2::new(rng.normal(), rng.normal()) * options.pixel_noise_px;
-        if !detected || !point.surface.faces(&center) {
-            continue;
-        }
-        let x_in_cam = pose.apply(&point.surface.xyz);
-        let Some(exact) = camera.project(&x_in_cam) else { continue };
-        if !(0.0..width).contains(&exact.0.x) || !(0.0..height).contains(&exact.0.y) {
-            continue;
-        }
-        let displacement =
-            if gross { nalgebra::Vector2::new(angle.cos(), angle.sin()) * error } else { nalgebra::Vector2::zeros() };
-        let pixel = Pixel(exact.0 + noise + displacement);
-        let scale = (point.size * camera.mean_focal_px() / x_in_cam.z) as f32;
-        let descriptor = describe(&point.look, options.descriptor_noise, rng);
-        sightings.push(sighting(pixel, scale, point.orientation, descriptor, Some(id)));
-    }
-    for _ in 0..(options.distractor_ratio * sightings.len() as f64) as usize {
-        let pixel = Pixel::new(rng.range(0.0, width), rng.range(0.0, height));
-        let scale = (2.0 * (0.5 * rng.normal()).exp()) as f32;
-        let orientation = rng.range(0.0, std::f64::consts::TAU) as f32;
-        let look = random_look(rng);
-        sightings.push(sighting(pixel, scale, orientation, describe(&look, 0.0, rng), None));
-    }
-    sightings.sort_by(|a, b| {
-        let (a, b) = (&a.keypoint, &b.keypoint);
-        b.scale
-            .total_cmp(&a.scale)
-            .then(a.y.total_cmp(&b.y))
-            .then(a.x.total_cmp(&b.x))
-            .then(a.orientation.total_cmp(&b.orientation))
-    });
-    sightings
-}
-
-fn sighting(pixel: Pixel, scale: f32, orientation: f32, descriptor: Descriptor, point: Option<usize>) -> Sighting {
-    let keypoint = Keypoint { x: pixel.0.x as f32, y: pixel.0.y as f32, scale, orientation };
-    Sighting { keypoint, pixel, descriptor, point }
 }
 
 fn matches_of(
