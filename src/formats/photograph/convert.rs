@@ -1,7 +1,7 @@
 //! Decoded pixels to 8-bit grey or colour, and reduction in size.
 
 use image::imageops::{self, FilterType};
-use image::{DynamicImage, ImageBuffer, Luma, Pixel, Rgb};
+use image::{DynamicImage, ImageBuffer, Luma, Pixel};
 
 use super::Decoded;
 use crate::scene::{GrayImage, RgbImage};
@@ -78,14 +78,35 @@ pub(super) fn shrink_gray(image: GrayImage, max_long_side: Option<u32>) -> Decod
     }
 }
 
-/// Reduces the longer side to `max_long_side`, where it is longer, by averaging: colours and thumbnails need no better.
+/// Reduces the longer side to `max_long_side`, where it is longer, by averaging boxes of whole pixels: colours and thumbnails
+/// need no better, and it costs little more than reading the raster.
 pub fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbImage> {
-    let RgbImage { width, height, data } = image;
+    let (width, height) = (image.width, image.height);
     let Some((new_width, new_height)) = reduced_size(width, height, max_long_side) else {
-        return Decoded { image: RgbImage::new(width, height, data), to_original: [1.0, 1.0] };
+        return Decoded { image, to_original: [1.0, 1.0] };
     };
-    let source = raster::<Rgb<u8>>(data, width, height);
-    let data = imageops::thumbnail(&source, new_width as u32, new_height as u32).into_raw();
+    let edge = |at: usize, new: usize, old: usize| at * old / new;
+    let columns: Vec<usize> = (0..=new_width).map(|x| edge(x, new_width, width)).collect();
+    let mut data = Vec::with_capacity(3 * new_width * new_height);
+    let mut sums = vec![[0_u32; 3]; new_width];
+    for y in 0..new_height {
+        sums.fill([0; 3]);
+        let rows = edge(y, new_height, height)..edge(y + 1, new_height, height);
+        for row in rows.clone() {
+            let row = image.data[3 * row * width..3 * (row + 1) * width].as_chunks::<3>().0;
+            for (sum, ends) in sums.iter_mut().zip(columns.windows(2)) {
+                for pixel in &row[ends[0]..ends[1]] {
+                    for (sum, &value) in sum.iter_mut().zip(pixel) {
+                        *sum += u32::from(value);
+                    }
+                }
+            }
+        }
+        for (sum, ends) in sums.iter().zip(columns.windows(2)) {
+            let count = ((ends[1] - ends[0]) * rows.len()) as u32;
+            data.extend(sum.map(|sum| ((sum + count / 2) / count) as u8));
+        }
+    }
     Decoded {
         image: RgbImage::new(new_width, new_height, data),
         to_original: [width as f64 / new_width as f64, height as f64 / new_height as f64],
