@@ -5,18 +5,25 @@ use std::collections::BinaryHeap;
 
 use crate::scene::{Descriptor, Features, Keypoint};
 
-/// Keeps the features of the `limit` largest scales.
-pub(super) struct Collector {
+/// Keeps the features of the `limit` largest scales among those at accepted places.
+pub(super) struct Collector<'a> {
     limit: usize,
+    /// Whether a feature at a pixel of the original image may be kept.
+    keeps: &'a dyn Fn(f32, f32) -> bool,
     /// The largest scales so far, smallest first. Positive floats sort as their bits do.
     scales: BinaryHeap<Reverse<u32>>,
     found: Vec<(Keypoint, Descriptor)>,
 }
 
-impl Collector {
-    /// Keeps `limit` features.
-    pub(super) fn new(limit: usize) -> Self {
-        Self { limit, scales: BinaryHeap::new(), found: Vec::new() }
+impl<'a> Collector<'a> {
+    /// Keeps `limit` features at places that `keeps` accepts.
+    pub(super) fn new(limit: usize, keeps: &'a dyn Fn(f32, f32) -> bool) -> Self {
+        Self { limit, keeps, scales: BinaryHeap::new(), found: Vec::new() }
+    }
+
+    /// Whether a feature at this pixel may be kept at all.
+    pub(super) fn wants_at(&self, x: f32, y: f32) -> bool {
+        (self.keeps)(x, y)
     }
 
     /// Whether a feature of this scale could still be among those kept, so that describing it is worth while.

@@ -44,12 +44,17 @@ const MIN_OCTAVE_SIDE: usize = 8;
 /// Images too small to hold a keypoint give no features. The result depends on nothing but the input and the machine's
 /// instruction set.
 pub fn extract(image: &GrayImage, options: &SiftOptions) -> Features {
-    extract_with(Isa::detect(), image, options)
+    extract_where(image, options, &|_, _| true)
 }
 
-fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions) -> Features {
+/// [`extract`], with only those features whose pixel `(x, y)` `keeps` accepts; the others do not count towards the limit.
+pub fn extract_where(image: &GrayImage, options: &SiftOptions, keeps: &dyn Fn(f32, f32) -> bool) -> Features {
+    extract_with(Isa::detect(), image, options, keeps)
+}
+
+fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions, keeps: &dyn Fn(f32, f32) -> bool) -> Features {
     let limit = options.limit(image.width, image.height);
-    let mut collector = Collector::new(limit);
+    let mut collector = Collector::new(limit, keeps);
     if image.width == 0 || image.height == 0 || limit == 0 {
         return collector.finish();
     }

@@ -96,7 +96,7 @@ impl<'a> Octave<'a> {
     }
 
     /// Finds and describes the features of the octave and returns the first level of the next.
-    pub(super) fn run(mut self, collector: &mut Collector) -> Plane {
+    pub(super) fn run(mut self, collector: &mut Collector<'_>) -> Plane {
         let (width, height) = (self.levels.width, self.levels.height);
         let per_octave = self.options.levels_per_octave;
         let mut next = Plane { width: width.div_ceil(2), height: height.div_ceil(2), data: Vec::new() };
@@ -178,21 +178,24 @@ impl<'a> Octave<'a> {
     }
 
     /// Turns an extremum into features.
-    fn describe(&self, extremum: &Extremum, worker: &mut Worker, collector: &mut Collector) {
+    fn describe(&self, extremum: &Extremum, worker: &mut Worker, collector: &mut Collector<'_>) {
         let sigma = level_sigma(self.options, extremum.level);
         let step = 2.0_f32.powi(self.index);
         let scale = self.scale_px(extremum);
         if !collector.wants(scale) {
             return;
         }
-        let ring = &self.levels.rings[extremum.s];
-        let size = (self.levels.width, self.levels.height);
         // Doubled pixels tile the original ones; from octave 0 on, every second pixel is kept, starting with the first.
         let offset = if self.index < 0 { 0.5 * step } else { 0.5 };
+        let (x, y) = (extremum.x * step + offset, extremum.y * step + offset);
+        if !collector.wants_at(x, y) {
+            return;
+        }
+        let ring = &self.levels.rings[extremum.s];
+        let size = (self.levels.width, self.levels.height);
         let (at, patch) = ((extremum.x, extremum.y), &mut worker.patch);
         for orientation in orientation::find(self.isa, ring, size, at, sigma, self.options.max_orientations, patch) {
-            let keypoint =
-                Keypoint { x: extremum.x * step + offset, y: extremum.y * step + offset, scale, orientation };
+            let keypoint = Keypoint { x, y, scale, orientation };
             let descriptor = worker.describer.describe(self.isa, ring, size, at, sigma, orientation, patch);
             collector.push(keypoint, descriptor);
         }

@@ -163,10 +163,10 @@ fn features_follow_turns_and_scales() {
 #[test]
 fn all_instruction_sets_agree() {
     let image = Scene::random(5, 400, 200.0, (0.8, 9.0)).render(203, 157);
-    let portable = extract_with(Isa::available()[0], &image, &SiftOptions::default());
+    let portable = extract_with(Isa::available()[0], &image, &SiftOptions::default(), &|_, _| true);
     assert!(portable.len() > 200);
     for &isa in &Isa::available()[1..] {
-        let other = extract_with(isa, &image, &SiftOptions::default());
+        let other = extract_with(isa, &image, &SiftOptions::default(), &|_, _| true);
         let mut twins = 0;
         for (a, descriptor) in portable.keypoints.iter().zip(&portable.descriptors) {
             twins += usize::from(other.keypoints.iter().zip(&other.descriptors).any(|(b, twin)| {
@@ -212,6 +212,18 @@ fn output_is_sorted_capped_and_repeatable() {
         let norm = f64::from(distance_sq(descriptor, &[0; 128])).sqrt();
         assert!((500.0..524.0).contains(&norm), "norm {norm}");
     }
+}
+
+#[test]
+fn masked_places_give_no_features_and_leave_the_limit_to_others() {
+    let image = Scene::random(9, 600, 200.0, (0.8, 9.0)).render(200, 200);
+    let right = |x: f32, _: f32| x >= 100.0;
+    let all = extract(&image, &SiftOptions::default());
+    let kept: Vec<_> = all.keypoints.iter().copied().filter(|k| right(k.x, k.y)).collect();
+    assert!(kept.len() > 100 && kept.len() < all.len());
+    assert_eq!(extract_where(&image, &SiftOptions::default(), &right).keypoints, kept);
+    let few = SiftOptions { max_features: 50, ..SiftOptions::default() };
+    assert_eq!(extract_where(&image, &few, &right).keypoints, kept[..50]);
 }
 
 #[test]

@@ -7,11 +7,12 @@ use std::sync::{Arc, Mutex};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::intake::{Intake, Refusal, advice};
+use super::intake::{InputFile, Intake, Refusal, advice};
+use super::masks::Mask;
 use super::options::ReconstructionOptions;
 use super::runner::{ArtifactKey, Counts, StageProgress, counts, io_error};
 use super::{Context, PipelineError, Stage, ready_features};
-use crate::features::extract;
+use crate::features::extract_where;
 use crate::formats::features as feature_file;
 use crate::formats::photograph::Photograph;
 use crate::scene::{Features, ImageId};
@@ -49,8 +50,13 @@ pub fn run(
         .par_iter()
         .map(|(id, file, _)| {
             context.check_cancelled()?;
-            let key =
-                ArtifactKey::of("features", &[&file.sha256, &options.features, &options.intake.max_long_side_px]).0;
+            let mask = file.mask.as_ref();
+            let mask_sha256 = mask.map(|mask| &mask.sha256);
+            let key = ArtifactKey::of(
+                "features",
+                &[&file.sha256, &mask_sha256, &options.features, &options.intake.max_long_side_px],
+            )
+            .0;
             let stored = store.get(&key).map_err(|source| io_error(Stage::Features, Path::new(&key), source))?;
             let stored = stored.and_then(|bytes| feature_file::from_bytes(&bytes, None).ok());
             let reused = stored.is_some();
@@ -58,7 +64,7 @@ pub fn run(
                 Some(features) => Ok(features.len()),
                 None => match ready
                     .get(&file.name)
-                    .map_or_else(|| extract_one(&folder.join(&file.name), options), |path| ready_features::read(path))?
+                    .map_or_else(|| extract_one(folder, file, options), |path| ready_features::read(path))?
                 {
                     Ok(features) => {
                         let bytes = feature_file::to_bytes(&features);
@@ -79,9 +85,14 @@ pub fn run(
     Ok((extracted.into_iter().map(|(id, image, _)| (id, image)).collect(), totals))
 }
 
-/// SIFT of one file, in pixels of the original picture.
-fn extract_one(path: &PathBuf, options: &ReconstructionOptions) -> Result<Result<Features, Refusal>, PipelineError> {
-    let bytes = std::fs::read(path).map_err(|source| io_error(Stage::Features, path, source))?;
+/// SIFT of one file where its mask keeps it, in pixels of the original picture.
+fn extract_one(
+    folder: &Path,
+    file: &InputFile,
+    options: &ReconstructionOptions,
+) -> Result<Result<Features, Refusal>, PipelineError> {
+    let path = folder.join(&file.name);
+    let bytes = std::fs::read(&path).map_err(|source| io_error(Stage::Features, &path, source))?;
     let decoded = Photograph::open(&bytes, &options.intake.limits())
         .and_then(|photograph| photograph.decode_gray(Some(options.intake.max_long_side_px)));
     let decoded = match decoded {
@@ -89,7 +100,14 @@ fn extract_one(path: &PathBuf, options: &ReconstructionOptions) -> Result<Result
         Err(error) => return Ok(Err(Refusal { code: error.code().to_owned(), advice: advice(&error) })),
     };
     drop(bytes);
-    let mut features = extract(&decoded.image, &options.features);
+    let mask = file.mask.as_ref().map(|mask| Mask::read(&folder.join(&mask.name), &options.intake.limits()));
+    let mask = match mask.transpose()?.transpose() {
+        Ok(mask) => mask,
+        Err(refusal) => return Ok(Err(refusal)),
+    };
+    let (width, height) = (decoded.image.width as f64, decoded.image.height as f64);
+    let kept = |x: f32, y: f32| mask.as_ref().is_none_or(|m| m.keeps(f64::from(x) / width, f64::from(y) / height));
+    let mut features = extract_where(&decoded.image, &options.features, &kept);
     let [scale_x, scale_y] = decoded.to_original;
     for keypoint in &mut features.keypoints {
         keypoint.x = (f64::from(keypoint.x) * scale_x) as f32;

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::masks::{self, MaskFile};
 use super::options::{IntakeOptions, KnownCamera};
 use super::{Context, PipelineError, ready_features};
 use crate::camera::{Camera, CameraModel, FocalSource, MAX_PARAMS};
@@ -51,6 +52,8 @@ pub struct InputFile {
     pub size: Option<(u32, u32)>,
     /// The photograph, or why there is none.
     pub photograph: Result<Photograph, Refusal>,
+    /// Its mask, if there is one.
+    pub mask: Option<MaskFile>,
 }
 
 /// Everything the later stages know of the input.
@@ -96,7 +99,8 @@ pub fn run(folder: &Path, options: &IntakeOptions, context: &Context) -> Result<
             Ok(inspect(folder, name, options))
         })
         .collect();
-    let inspected: Vec<InputFile> = inspected.into_iter().collect::<Result<_, _>>()?;
+    let mut inspected: Vec<InputFile> = inspected.into_iter().collect::<Result<_, _>>()?;
+    masks::assign(&mut inspected);
     Ok(group_cameras(refuse_duplicates(inspected), options))
 }
 
@@ -128,7 +132,7 @@ fn list(root: &Path, folder: &Path, names: &mut Vec<String>) -> std::io::Result<
 fn inspect(folder: &Path, name: &str, options: &IntakeOptions) -> InputFile {
     let refused = |sha256: Option<String>, size: Option<(u32, u32)>, code: &str, advice: String| {
         let photograph = Err(Refusal { code: code.to_owned(), advice });
-        InputFile { name: name.to_owned(), sha256, size, photograph }
+        InputFile { name: name.to_owned(), sha256, size, photograph, mask: None }
     };
     let path: PathBuf = folder.join(name);
     let bytes = match std::fs::read(&path) {
@@ -141,7 +145,7 @@ fn inspect(folder: &Path, name: &str, options: &IntakeOptions) -> InputFile {
             let size = Some((info.width, info.height));
             let photograph =
                 Ok(Photograph { width: info.width, height: info.height, camera: CameraId(0), exif: info.exif });
-            InputFile { name: name.to_owned(), sha256, size, photograph }
+            InputFile { name: name.to_owned(), sha256, size, photograph, mask: None }
         }
         Err(error) => refused(sha256, stated_size(&error), error.code(), advice(&error)),
     }

@@ -9,6 +9,7 @@ mod features;
 mod focals;
 mod intake;
 mod localise;
+mod masks;
 mod measure;
 mod options;
 mod ready_features;

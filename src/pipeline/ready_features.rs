@@ -44,7 +44,7 @@ pub fn inspect(folder: &Path) -> Result<Vec<InputFile>, PipelineError> {
             Ok(_) => Ok(Photograph { width, height, camera: CameraId(0), exif }),
             Err(error) => Err(refusal(&format!("The features could not be read: {error}."))),
         };
-        InputFile { name, sha256: digest.ok(), size: Some((width, height)), photograph }
+        InputFile { name, sha256: digest.ok(), size: Some((width, height)), photograph, mask: None }
     };
     Ok(images.into_par_iter().map(inspect_one).collect())
 }

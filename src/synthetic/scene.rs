@@ -196,6 +196,7 @@ pub fn perturbed(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::Descriptor;
 
     #[test]
     fn exact_scenes_reproject_exactly() {
