@@ -5,24 +5,24 @@
 .PHONY: test demo setup page clean
 
 test: setup
-	@scripts/test.sh
+	@tests/run.sh
 
 demo: page
 	cargo build --release --locked
 	target/release/multistage demo
 
-# What the tests need besides Rust: the page's third-party code, a browser, an independent reader of COLMAP files.
-setup: page web/node_modules/.package-lock.json
-	@scripts/setup.sh
+# What the tests need besides Rust: the page's third-party code, a browser and what drives it, an independent reader of COLMAP files.
+setup: page tests/page/node_modules/.package-lock.json
+	@tests/setup.sh
 
 # The page's third-party code, bundled into static/vendor.
 page: static/vendor/three.js
 
-web/node_modules/.package-lock.json: web/package-lock.json
-	cd web && npm ci --ignore-scripts --no-audit --no-fund
+static/vendor/three.js: static/node_modules/.package-lock.json static/three-entry.mjs static/vendor.mjs
+	cd static && npm run --silent vendor
 
-static/vendor/three.js: web/node_modules/.package-lock.json web/three-entry.mjs web/vendor.mjs
-	cd web && npm run --silent vendor
+%/node_modules/.package-lock.json: %/package-lock.json
+	cd $* && npm ci --ignore-scripts --no-audit --no-fund
 
 clean:
-	rm -rf target static/vendor web/node_modules .venv
+	rm -rf target static/vendor static/node_modules tests/page/node_modules .venv

@@ -1,4 +1,5 @@
-//! The page: the files of `static/`, embedded into the program.
+//! The page: the files of `static/`, embedded into the program. What builds them (the npm project) lies beside them and is
+//! left out.
 
 use axum::body::Body;
 use axum::http::{HeaderMap, HeaderValue, header};
@@ -10,6 +11,11 @@ use super::problem::{Code, Problem};
 
 #[derive(RustEmbed)]
 #[folder = "$CARGO_MANIFEST_DIR/static"]
+#[include = "index.html"]
+#[include = "css/*"]
+#[include = "img/*"]
+#[include = "js/*"]
+#[include = "vendor/*"]
 #[allow_missing = true]
 struct Files;
 

@@ -15,6 +15,10 @@ async fn the_page_comes_with_its_files_and_fences() {
     assert_eq!(again.status.as_u16(), 304);
     assert_eq!(service.get("/static/css/base.css").await.header("content-type"), "text/css; charset=utf-8");
     assert_eq!(service.get("/static/js/main.js").await.header("content-type"), "text/javascript; charset=utf-8");
+    assert_eq!(service.get("/static/js/viewer/panel.js").await.status.as_u16(), 200);
+    for path in ["/static/package.json", "/static/vendor.mjs"] {
+        service.get(path).await.assert_problem(404, "not_found");
+    }
     for path in ["/static/nothing.js", "/static/../Cargo.toml", "/static/%2e%2e/Cargo.toml", "/static//etc/passwd"] {
         service.get(path).await.assert_problem(404, "not_found");
     }

@@ -6,14 +6,14 @@ import { build } from "esbuild";
 
 const here = (path) => fileURLToPath(new URL(path, import.meta.url));
 
-await mkdir(here("../static/vendor"), { recursive: true });
+await mkdir(here("vendor"), { recursive: true });
 await build({
   entryPoints: [here("three-entry.mjs")],
-  outfile: here("../static/vendor/three.js"),
+  outfile: here("vendor/three.js"),
   bundle: true,
   minify: true,
   format: "esm",
   target: "es2022",
   legalComments: "inline",
 });
-await copyFile(here("node_modules/three/LICENSE"), here("../static/vendor/three.LICENSE.txt"));
+await copyFile(here("node_modules/three/LICENSE"), here("vendor/three.LICENSE.txt"));

@@ -56,7 +56,7 @@ passed=$((passed + p)) failed=$((failed + f)) skipped=$((skipped + s))
 log=$logs/browser.tap
 MULTISTAGE_BIN="$PWD/target/debug/multistage" node --test --test-concurrency=1 \
   --test-reporter=spec --test-reporter-destination=stdout --test-reporter=tap --test-reporter-destination="$log" \
-  web/test/*.test.mjs
+  tests/page/*.test.mjs
 status=$?
 read -r p f s < <(awk '/^# pass /{p=$3} /^# (fail|cancelled) /{f+=$3} /^# (skipped|todo) /{s+=$3} END {print p+0, f+0, s+0}' "$log")
 [ "$status" != 0 ] && [ "$f" = 0 ] && f=1

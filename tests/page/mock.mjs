@@ -1,6 +1,6 @@
 // A stand-in for the service, for work on the page and for what the real one does too seldom to be tested on it: requests that
 // fail on the way, slow stages, several models. It keeps to openapi.yaml. Run by itself it prints its address:
-//     node web/test/mock.mjs
+//     node tests/page/mock.mjs
 import { readFile } from "node:fs/promises";
 import { createServer } from "node:http";
 import { extname, join, normalize } from "node:path";

@@ -8,7 +8,7 @@ import { distinctColours, noBrowser, openBrowser, openPage } from "./browser.mjs
 import { startMock } from "./mock.mjs";
 
 const skip = noBrowser;
-const AXE = await readFile(new URL("../node_modules/axe-core/axe.min.js", import.meta.url), "utf8");
+const AXE = await readFile(new URL("./node_modules/axe-core/axe.min.js", import.meta.url), "utf8");
 
 let browser;
 let folder;
