@@ -125,18 +125,18 @@ async fn show(address: SocketAddr, folder: &Path, photographs: &[PathBuf]) -> Re
 fn progress_line(job: &Value) -> String {
     let stage = &job["stage"];
     let Some(name) = stage["name"].as_str() else { return String::new() };
-    let round = stage["iteration"].as_i64().map(|iteration| format!(" {iteration}")).unwrap_or_default();
+    let round = stage["iteration"].as_i64().map(|iteration| format!(", round {iteration}:")).unwrap_or_default();
     match (stage["done"].as_i64(), stage["total"].as_i64()) {
-        (Some(done), Some(total)) if total > 0 => format!("{name}{round} {}0 %", 10 * done / total),
+        (Some(done), Some(total)) if total > 0 => format!("{name}{round} {} %", 10 * (10 * done / total)),
         _ => format!("{name}{round}"),
     }
 }
 
 fn print_result(address: SocketAddr, folder: &Path, job: &Value) {
     let images = &job["images"];
-    println!("\nDone: {} of {} photographs placed, {} models", images["registered"], images["uploaded"], {
-        job["models"].as_array().map_or(0, Vec::len)
-    });
+    let models = job["models"].as_array().map_or(0, Vec::len);
+    let models = if models == 1 { "one model".to_owned() } else { format!("{models} models") };
+    println!("\nDone: {} of {} photographs placed, {models}", images["registered"], images["uploaded"]);
     if let Some(model) = job["models"].get(0) {
         println!(
             "  {} points, {} seen three times or more; mean reprojection error {:.2} px",
@@ -146,7 +146,7 @@ fn print_result(address: SocketAddr, folder: &Path, job: &Value) {
         );
     }
     let link = |value: &Value| format!("http://{address}{}", value.as_str().unwrap_or_default());
-    println!("  page      http://{address}/");
+    println!("  page      http://{address}/#/jobs/{}", job["id"].as_str().unwrap_or_default());
     println!("  points    {}", link(&job["models"][0]["links"]["points"]));
     println!("  report    {}", link(&job["links"]["report"]));
     println!("  all files {}", link(&job["links"]["archive"]));

@@ -89,19 +89,31 @@ pub(super) fn write_temple(
     let images = out.join("images");
     fs::create_dir_all(&images)?;
     let temple = Temple::new(options);
-    let camera = temple.camera();
-    let exif = invented_exif("Ray caster", &camera);
-    let mut truth = Reconstruction::new([(CameraId(0), camera)].into());
+    let cameras = [0, 1].map(|index| temple.camera(index));
+    let exif = options.exif_focal_factor.map(|factor| {
+        let mut stated = cameras[0].clone();
+        stated.set_focal(factor * stated.focal().0, factor * stated.focal().1);
+        invented_exif("Ray caster", &stated)
+    });
+    let num_cameras = if cameras[0] == cameras[1] { 1 } else { 2 };
+    let mut truth = Reconstruction::new((0u32..).map(CameraId).zip(cameras).take(num_cameras).collect());
     let mut names = Vec::new();
     let mut paths = Vec::new();
     for index in 0..options.num_images {
         let jpeg = photograph::encode_jpeg(&temple.photograph(index), JPEG_QUALITY).map_err(io::Error::other)?;
-        let mut file = Vec::with_capacity(jpeg.len());
-        exif::write_app1(&jpeg, &exif, &mut file)?;
+        let file = match &exif {
+            Some(exif) => {
+                let mut file = Vec::with_capacity(jpeg.len());
+                exif::write_app1(&jpeg, exif, &mut file)?;
+                file
+            }
+            None => jpeg,
+        };
         let name = temple_name(index);
         let path = images.join(&name);
         fs::write(&path, file)?;
-        truth.register(ImageId(index as u32), CameraId(0), temple.cam_from_world(index), [].into());
+        let camera = CameraId((index % num_cameras) as u32);
+        truth.register(ImageId(index as u32), camera, temple.cam_from_world(index), [].into());
         names.push(name);
         paths.push(path);
         progress(index + 1);

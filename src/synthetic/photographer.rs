@@ -54,10 +54,16 @@ type Look = [f64; DESCRIPTOR_LEN];
 impl<'a> Photographer<'a> {
     /// Lays out the scene of these options.
     pub fn new(options: &'a SceneOptions) -> Self {
-        let num_cameras = if options.shared_camera { 1 } else { options.num_images };
+        let num_cameras = match options.shared_camera {
+            true if options.zoom == 1.0 => 1,
+            true => 2,
+            false => options.num_images,
+        };
         let cameras = (0..num_cameras).map(|id| {
-            let spread = if options.shared_camera { 0.0 } else { 0.05 };
-            let factor = 1.0 + spread * Stream::Camera.rng(options, id).range(-1.0, 1.0);
+            let factor = match options.shared_camera {
+                true => [1.0, options.zoom][id],
+                false => 1.0 + 0.05 * Stream::Camera.rng(options, id).range(-1.0, 1.0),
+            };
             (CameraId(id as u32), camera(options, factor))
         });
         let points = (0..options.num_points).map(|id| appearance(options, id).0).collect();
@@ -72,7 +78,7 @@ impl<'a> Photographer<'a> {
     /// Image `index` and its features.
     pub fn photograph(&self, index: usize) -> (Picture, Features) {
         let options = self.options;
-        let camera = CameraId(if options.shared_camera { 0 } else { index as u32 });
+        let camera = CameraId((index % self.cameras.len()) as u32);
         let pose = options.layout.pose(index, options.num_images, &mut Stream::Pose.rng(options, index));
         let sightings = self.sightings(&self.cameras[&camera], &pose, &mut Stream::Image.rng(options, index));
         let picture = Picture {

@@ -36,6 +36,8 @@ pub struct SceneOptions {
     pub camera_model: CameraModel,
     /// Focal length in pixels.
     pub focal_px: f64,
+    /// Factor of the focal length in every other image of a shared camera, as after zooming; 1: none.
+    pub zoom: f64,
     /// Distortion `(k1, k2, p1, p2)`; what the model lacks is ignored.
     pub distortion: [f64; 4],
     /// One camera for all images; otherwise one each, with focal lengths that differ by some percent.
@@ -65,6 +67,7 @@ impl Default for SceneOptions {
             height: 800,
             camera_model: CameraModel::SimpleRadial,
             focal_px: 1100.0,
+            zoom: 1.0,
             distortion: [-0.05, 0.01, 0.0005, -0.0005],
             shared_camera: true,
             pixel_noise_px: 0.0,

@@ -3,9 +3,7 @@
 //! Carving and stains differ from side to side, so opposite sides are not mistaken for each other. Every picture has an
 //! exposure and sensor noise of its own. The same options give the same bytes for any number of threads.
 
-use std::f64::consts::TAU;
-
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -23,14 +21,20 @@ use crate::scene::RgbImage;
 pub struct TempleOptions {
     /// Seed of the stones, the poses and the noise.
     pub seed: u64,
-    /// Number of photographs, from all round; every fourth is taken from above.
+    /// Number of photographs, evenly along the arc; every fourth is taken from above.
     pub num_images: usize,
+    /// Degrees of the circle around the temple that the photographs are taken from; 360: from all round.
+    pub arc_deg: f64,
     /// Columns of every photograph.
     pub width: u32,
     /// Rows of every photograph.
     pub height: u32,
     /// Focal length in multiples of the width.
     pub focal_ratio: f64,
+    /// Factor of the focal length in every other photograph, as after zooming; 1: none.
+    pub zoom: f64,
+    /// The focal length that EXIF states, as a factor of the true one without zoom; null: there is no EXIF.
+    pub exif_focal_factor: Option<f64>,
     /// First radial distortion coefficient.
     pub k1: f64,
     /// Largest change of exposure, as a share of the mean.
@@ -44,9 +48,12 @@ impl Default for TempleOptions {
         Self {
             seed: 0,
             num_images: 30,
+            arc_deg: 360.0,
             width: 1280,
             height: 960,
             focal_ratio: 0.86,
+            zoom: 1.0,
+            exif_focal_factor: Some(1.0),
             k1: -0.06,
             exposure_spread: 0.25,
             noise: 1.5,
@@ -63,9 +70,13 @@ impl TempleOptions {
             }
         };
         check((1..=10_000).contains(&self.num_images), "num_images must be 1 to 10000");
+        check(self.arc_deg > 0.0 && self.arc_deg <= 360.0, "arc_deg must be above 0 and at most 360");
         check((16..=16_384).contains(&self.width), "width must be 16 to 16384");
         check((16..=16_384).contains(&self.height), "height must be 16 to 16384");
         check((0.3..=5.0).contains(&self.focal_ratio), "focal_ratio must be 0.3 to 5");
+        check((0.5..=2.0).contains(&self.zoom), "zoom must be 0.5 to 2");
+        let stated = self.exif_focal_factor.unwrap_or(1.0);
+        check((0.25..=4.0).contains(&stated), "exif_focal_factor must be 0.25 to 4, or null");
         check((-0.15..=0.15).contains(&self.k1), "k1 must be -0.15 to 0.15");
         check((0.0..=0.5).contains(&self.exposure_spread), "exposure_spread must be 0 to 0.5");
         check((0.0..=50.0).contains(&self.noise), "noise must be 0 to 50");
@@ -90,6 +101,8 @@ enum Stream {
     Noise,
 }
 
+/// Rows that one task renders; the rays between two tasks' rows are cast by both.
+const BAND_ROWS: usize = 16;
 /// How far from a surface its shadow ray starts, in metres: more than the rounding of single precision at 40 m.
 const SHADOW_OFFSET: f32 = 2e-3;
 /// Where samples of a pixel lie in it: a rotated grid.
@@ -103,10 +116,11 @@ impl Temple {
         Self { options: options.clone(), solids: Solids::new(&mut rng), seed }
     }
 
-    /// The camera of all photographs.
-    pub fn camera(&self) -> Camera {
+    /// The camera of a photograph.
+    pub fn camera(&self, index: usize) -> Camera {
         let options = &self.options;
-        let focal_px = options.focal_ratio * f64::from(options.width);
+        let zoom = if index.is_multiple_of(2) { 1.0 } else { options.zoom };
+        let focal_px = options.focal_ratio * zoom * f64::from(options.width);
         let mut camera =
             Camera::centered(CameraModel::SimpleRadial, options.width, options.height, focal_px, FocalSource::Known);
         camera.params[CameraModel::SimpleRadial.distortion_index()] = options.k1;
@@ -117,7 +131,8 @@ impl Temple {
     pub fn cam_from_world(&self, index: usize) -> Rigid3 {
         let mut rng = Rng::from_parts(&[self.options.seed, Stream::Pose as u64, index as u64]);
         let mut jitter = |size: f64| rng.range(-size, size);
-        let angle = TAU * (index as f64 + 0.2 * jitter(1.0)) / self.options.num_images as f64;
+        let step = self.options.arc_deg.to_radians() / self.options.num_images as f64;
+        let angle = step * (index as f64 + 0.2 * jitter(1.0));
         let above = index % 4 == 3;
         let (reach, height) = if above { (18.5, 7.5 + jitter(1.5)) } else { (16.5, 1.7 + jitter(0.2)) };
         let reach = reach * (1.0 + 0.05 * jitter(1.0));
@@ -136,7 +151,7 @@ impl Temple {
     /// The place on a surface that a pixel of a photograph shows, unless it shows the sky.
     pub fn surface_at(&self, index: usize, pixel: &Pixel) -> Option<Vector3<f64>> {
         let pose = self.cam_from_world(index);
-        let ray = pose.rotation.inverse() * self.camera().unproject(pixel).homogeneous();
+        let ray = pose.rotation.inverse() * self.camera(index).unproject(pixel).homogeneous();
         let center = pose.target_origin_in_source();
         let hit = self.solids.nearest(&center.cast(), &ray.cast())?;
         Some(center + ray * f64::from(hit.distance))
@@ -145,63 +160,27 @@ impl Temple {
     /// A photograph.
     pub fn photograph(&self, index: usize) -> RgbImage {
         let (width, height) = (self.options.width as usize, self.options.height as usize);
-        let (camera, pose) = (self.camera(), self.cam_from_world(index));
-        let center: Vec3 = pose.target_origin_in_source().cast();
-        let world_from_cam = pose.rotation.inverse();
-        // Rays through the corners of all pixels of a row; between corners the distortion is as good as linear.
-        let corners = |y: usize| -> Vec<Vec3> {
-            let ray = |x: usize| world_from_cam * camera.unproject(&Pixel::new(x as f64, y as f64)).homogeneous();
-            (0..=width).map(|x| ray(x).cast()).collect()
-        };
+        let view = View::new(self, index);
         let mut exposure = Rng::from_parts(&[self.options.seed, Stream::Exposure as u64, index as u64]);
         let exposure = (1.0 + self.options.exposure_spread * exposure.range(-1.0, 1.0)) as f32;
-        let pixel_angle = camera.px_to_normalized(1.0) as f32;
         let mut data = vec![0u8; 3 * width * height];
-        data.par_chunks_exact_mut(3 * width).enumerate().for_each(|(y, row)| {
-            let (upper, lower) = (corners(y), corners(y + 1));
-            let mut rng = Rng::from_parts(&[self.options.seed, Stream::Noise as u64, index as u64, y as u64]);
-            for (x, out) in row.chunks_exact_mut(3).enumerate() {
-                let rays = SAMPLES.map(|[u, v]| {
-                    let top = upper[x] + (upper[x + 1] - upper[x]) * u;
-                    let bottom = lower[x] + (lower[x + 1] - lower[x]) * u;
-                    (top + (bottom - top) * v).normalize()
-                });
-                let sum = self.light_of_pixel(&center, &rays, pixel_angle);
-                for (out, sum) in out.iter_mut().zip(sum) {
-                    let level = 255.0 * developed(exposure * sum / SAMPLES.len() as f32);
-                    *out = (f64::from(level) + self.options.noise * rng.normal()).round().clamp(0.0, 255.0) as u8;
+        data.par_chunks_mut(3 * width * BAND_ROWS).enumerate().for_each(|(band, rows)| {
+            let first = band * BAND_ROWS;
+            let mut upper = view.corners(first);
+            for (y, row) in (first..).zip(rows.chunks_exact_mut(3 * width)) {
+                let lower = view.corners(y + 1);
+                let mut rng = Rng::from_parts(&[self.options.seed, Stream::Noise as u64, index as u64, y as u64]);
+                for (x, out) in row.chunks_exact_mut(3).enumerate() {
+                    let light = view.light_of_pixel([&upper[x], &upper[x + 1], &lower[x], &lower[x + 1]]);
+                    for (out, light) in out.iter_mut().zip(light) {
+                        let level = 255.0 * developed(exposure * light);
+                        *out = (f64::from(level) + self.options.noise * rng.normal()).round().clamp(0.0, 255.0) as u8;
+                    }
                 }
+                upper = lower;
             }
         });
         RgbImage::new(width, height, data)
-    }
-
-    /// The sum of the light that comes along the rays of a pixel. Where all meet the same face, the light of their mean
-    /// stands for all: details smaller than a pixel are left out of the stones anyway.
-    fn light_of_pixel(&self, center: &Vec3, rays: &[Vec3; SAMPLES.len()], pixel_angle: f32) -> [f32; 3] {
-        const SAME_FACE_COSINE: f32 = 0.8;
-        let hits = rays.map(|ray| self.solids.nearest(center, &ray));
-        let same_face = hits.iter().all(|hit| match (hit, &hits[0]) {
-            (Some(a), Some(b)) => a.id == b.id && a.normal.dot(&b.normal) > SAME_FACE_COSINE,
-            (None, None) => true,
-            _ => false,
-        });
-        if same_face {
-            let ray = rays.iter().sum::<Vec3>().normalize();
-            if let Some(hit) = self.solids.nearest(center, &ray)
-                && hits[0].is_some_and(|first| first.id == hit.id)
-            {
-                return self.light(center, &ray, &hit, pixel_angle).map(|light| light * SAMPLES.len() as f32);
-            }
-        }
-        let mut sum = [0.0; 3];
-        for (ray, hit) in rays.iter().zip(&hits) {
-            let light = hit.as_ref().map_or_else(|| sky(ray), |hit| self.light(center, ray, hit, pixel_angle));
-            for (sum, light) in sum.iter_mut().zip(light) {
-                *sum += light;
-            }
-        }
-        sum
     }
 
     /// The light that a surface sends back along a ray.
@@ -223,6 +202,82 @@ impl Temple {
             let near = color[i] * (direct * warm[i] + ambient * cool[i]);
             near + (far[i] - near) * haze
         })
+    }
+}
+
+/// A photograph in the making.
+struct View<'a> {
+    temple: &'a Temple,
+    camera: Camera,
+    world_from_cam: UnitQuaternion<f64>,
+    center: Vec3,
+    /// What a pixel in the middle covers, in radians.
+    pixel_angle: f32,
+}
+
+/// The corner of four pixels.
+struct Corner {
+    /// From the camera's centre through it; not of unit length.
+    ray: Vec3,
+    hit: Option<Hit>,
+}
+
+impl<'a> View<'a> {
+    fn new(temple: &'a Temple, index: usize) -> Self {
+        let (camera, pose) = (temple.camera(index), temple.cam_from_world(index));
+        Self {
+            temple,
+            world_from_cam: pose.rotation.inverse(),
+            center: pose.target_origin_in_source().cast(),
+            pixel_angle: camera.px_to_normalized(1.0) as f32,
+            camera,
+        }
+    }
+
+    /// The upper corners of a row of pixels. Between corners the distortion is as good as linear.
+    fn corners(&self, y: usize) -> Vec<Corner> {
+        let corner = |x: u32| {
+            let pixel = Pixel::new(f64::from(x), y as f64);
+            let ray: Vec3 = (self.world_from_cam * self.camera.unproject(&pixel).homogeneous()).cast();
+            Corner { ray, hit: self.temple.solids.nearest(&self.center, &ray) }
+        };
+        (0..=self.camera.width).map(corner).collect()
+    }
+
+    /// The light that falls on a pixel between its upper left, upper right, lower left and lower right corner. Where all four
+    /// see one face, the light of the middle stands for all: details smaller than a pixel are left out of the stones anyway.
+    fn light_of_pixel(&self, corners: [&Corner; 4]) -> [f32; 3] {
+        const SAME_FACE_COSINE: f32 = 0.8;
+        let ray = |[u, v]: [f32; 2]| {
+            let between = |a: &Corner, b: &Corner| a.ray + (b.ray - a.ray) * u;
+            let (top, bottom) = (between(corners[0], corners[1]), between(corners[2], corners[3]));
+            (top + (bottom - top) * v).normalize()
+        };
+        let solids = &self.temple.solids;
+        let middle = ray([0.5, 0.5]);
+        match &corners[0].hit {
+            None if corners.iter().all(|corner| corner.hit.is_none()) => return sky(&middle),
+            Some(first) => {
+                let same = |hit: &Hit| hit.id == first.id && hit.normal.dot(&first.normal) > SAME_FACE_COSINE;
+                if corners.iter().all(|corner| corner.hit.as_ref().is_some_and(same))
+                    && let Some(hit) = solids.meet(first.id, &self.center, &middle)
+                {
+                    return self.temple.light(&self.center, &middle, &hit, self.pixel_angle);
+                }
+            }
+            None => {}
+        }
+        let mut sum = [0.0; 3];
+        for ray in SAMPLES.map(ray) {
+            let light = match solids.nearest(&self.center, &ray) {
+                Some(hit) => self.temple.light(&self.center, &ray, &hit, self.pixel_angle),
+                None => sky(&ray),
+            };
+            for (sum, light) in sum.iter_mut().zip(light) {
+                *sum += light / SAMPLES.len() as f32;
+            }
+        }
+        sum
     }
 }
 
@@ -288,7 +343,7 @@ mod tests {
     #[test]
     fn corners_are_seen_where_the_pose_and_the_camera_say() {
         let temple = Temple::new(&TempleOptions { seed: 3, ..TempleOptions::default() });
-        let camera = temple.camera();
+        let camera = temple.camera(0);
         let mut seen = 0;
         for index in 0..30 {
             let pose = temple.cam_from_world(index);

@@ -66,6 +66,8 @@ struct Node {
 pub(super) struct Solids {
     solids: Vec<Solid>,
     nodes: Vec<Node>,
+    /// Where the solid of an id stands in `solids`; the ground's id, 0, has no meaning here.
+    place_of_id: Vec<u32>,
 }
 
 /// Solids of a leaf at most.
@@ -90,6 +92,8 @@ const WALL_HALF: [f32; 2] = [4.4, 2.5];
 const COLUMN_RADIUS: f32 = 0.36;
 const WINDOW_DEPTH: f32 = 0.3;
 const NUM_RUBBLE: usize = 46;
+/// Where the ground ends, in lengths of a ray's direction: far behind the haze.
+const HORIZON: f32 = 1e4;
 
 #[derive(Default)]
 struct Builder {
@@ -216,7 +220,21 @@ impl Solids {
         let mut nodes = Vec::new();
         let len = solids.len();
         build(&mut solids, 0, len, &mut nodes);
-        Self { solids, nodes }
+        let mut place_of_id = vec![0; len + 1];
+        for (place, solid) in (0u32..).zip(&solids) {
+            place_of_id[solid.id as usize] = place;
+        }
+        Self { solids, nodes, place_of_id }
+    }
+
+    /// Where a ray meets the solid of this id, whatever else stands in its way.
+    pub(super) fn meet(&self, id: u32, origin: &Vec3, direction: &Vec3) -> Option<Hit> {
+        if id == 0 {
+            return ground(origin, direction);
+        }
+        let solid = &self.solids[self.place_of_id[id as usize] as usize];
+        let (distance, normal) = solid.meet(origin, direction, &direction.map(|d| 1.0 / d))?;
+        Some(Hit { distance, normal, material: solid.material, id })
     }
 
     /// The nearest surface on a ray, ground included.
@@ -233,30 +251,40 @@ impl Solids {
         nearest.is_some()
     }
 
+    /// Goes through the tree, near boxes first; with `any`, up to the first hit.
     fn walk(&self, origin: &Vec3, direction: &Vec3, nearest: &mut Option<Hit>, any: bool) {
         let inverse = direction.map(|d| 1.0 / d);
-        let mut stack = [0u32; STACK_LEN];
+        let enter = |at: u32| {
+            let node = &self.nodes[at as usize];
+            slabs(&node.low, &node.high, origin, &inverse).map_or(f32::INFINITY, |(enter, _, _)| enter)
+        };
+        let mut limit = nearest.map_or(f32::INFINITY, |hit| hit.distance);
+        let mut stack = [(0u32, 0f32); STACK_LEN];
+        stack[0] = (0, enter(0));
         let mut depth = 1;
         while depth > 0 {
             depth -= 1;
-            let at = stack[depth];
-            let node = &self.nodes[at as usize];
-            let limit = nearest.map_or(f32::INFINITY, |hit| hit.distance);
-            let Some((enter, _, _)) = slabs(&node.low, &node.high, origin, &inverse) else { continue };
-            if enter >= limit {
+            let (at, entered) = stack[depth];
+            if entered >= limit {
                 continue;
             }
+            let node = &self.nodes[at as usize];
             if node.count == 0 {
-                stack[depth] = node.at;
-                stack[depth + 1] = at + 1;
-                depth += 2;
+                let (a, b) = ((at + 1, enter(at + 1)), (node.at, enter(node.at)));
+                let (near, far) = if a.1 <= b.1 { (a, b) } else { (b, a) };
+                for child in [far, near] {
+                    if child.1 < limit {
+                        stack[depth] = child;
+                        depth += 1;
+                    }
+                }
                 continue;
             }
             for solid in &self.solids[node.at as usize..(node.at + node.count) as usize] {
-                let limit = nearest.map_or(f32::INFINITY, |hit| hit.distance);
                 if let Some((distance, normal)) = solid.meet(origin, direction, &inverse)
                     && distance < limit
                 {
+                    limit = distance;
                     *nearest = Some(Hit { distance, normal, material: solid.material, id: solid.id });
                     if any {
                         return;
@@ -269,7 +297,7 @@ impl Solids {
 
 fn ground(origin: &Vec3, direction: &Vec3) -> Option<Hit> {
     let distance = -origin.z / direction.z;
-    (direction.z < 0.0 && distance > 0.0).then(|| Hit {
+    (direction.z < 0.0 && distance > 0.0 && distance < HORIZON).then(|| Hit {
         distance,
         normal: Vec3::z(),
         material: Material::Ground,
@@ -283,11 +311,14 @@ fn slabs(low: &Vec3, high: &Vec3, origin: &Vec3, inverse: &Vec3) -> Option<(f32,
     let (mut enter, mut leave, mut axis) = (f32::NEG_INFINITY, f32::INFINITY, 0);
     for i in 0..3 {
         let (a, b) = ((low[i] - origin[i]) * inverse[i], (high[i] - origin[i]) * inverse[i]);
-        let near = a.min(b);
+        // A ray in the plane of a face gives NaN; every comparison with it is false, which leaves the bound as it is.
+        let (near, far) = if a < b { (a, b) } else { (b, a) };
         if near > enter {
             (enter, axis) = (near, i);
         }
-        leave = leave.min(a.max(b));
+        if far < leave {
+            leave = far;
+        }
     }
     (enter <= leave && leave > 0.0).then_some((enter, leave, axis))
 }

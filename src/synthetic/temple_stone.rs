@@ -57,7 +57,7 @@ fn octaves(p: &Vec3, footprint: f32, seed: u32, sizes: &[(f32, f32)]) -> f32 {
     sum
 }
 
-const GRAIN: [(f32, f32); 6] = [(0.62, 0.24), (0.27, 0.26), (0.125, 0.26), (0.06, 0.24), (0.03, 0.2), (0.012, 0.16)];
+const GRAIN: [(f32, f32); 6] = [(0.62, 0.2), (0.27, 0.2), (0.125, 0.22), (0.06, 0.26), (0.03, 0.28), (0.012, 0.22)];
 
 /// Coordinates on a surface: along it, and up (or across, where it lies flat).
 fn on_surface(p: &Vec3, normal: &Vec3) -> (f32, f32) {
@@ -117,12 +117,11 @@ pub(super) fn stone(
     let own = seed ^ id.wrapping_mul(0x632b_e5ab) ^ side_of(normal).wrapping_mul(0x1f12_3bb5);
     let grain = octaves(p, footprint, seed, &GRAIN);
     let stain = noise(&(p / 2.3), seed ^ 0x99) + 0.5 * noise(&(p / 0.9), seed ^ 0x9a);
-    // Pits: dark spots where a coarse noise is high.
-    let pits = {
-        let share = visible(0.11, footprint);
-        let deep = noise(&(p / 0.11), seed ^ 0x3c);
-        share * ((deep - 0.35) * 3.0).clamp(0.0, 1.0)
-    };
+    // Pits: dark spots where noise is high, of two sizes.
+    let pits = [(0.085, 0.45, 0x3c), (0.04, 0.4, 0x3d)].iter().fold(0.0f32, |pits, &(size, from, salt)| {
+        let deep = noise(&(p / size), seed ^ salt);
+        pits.max(visible(size, footprint) * ((deep - from) * 2.5).clamp(0.0, 0.8))
+    });
     let joint_of = |joint: f32, width: f32| {
         let rough = 1.0 + 0.6 * noise(&(p / 0.07), seed ^ 0x42);
         (1.0 - joint / (width * rough + footprint)).clamp(0.0, 1.0) * (width / (width + 0.5 * footprint))
