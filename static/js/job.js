@@ -120,8 +120,8 @@ export function jobView(main, id) {
       h("dl", { class: "facts" },
         fact("pictures placed", `${count(model.images)} of ${count(job.images.uploaded)}`),
         fact("points", count(model.points)),
-        fact("seen in 3 or more", count(model.points_3plus)),
-        fact("pictures a point", fixed(model.mean_track_length, 2)),
+        fact("points in 3 or more pictures", count(model.points_3plus)),
+        fact("pictures per point, mean", fixed(model.mean_track_length, 2)),
         fact("mean error, pixels", fixed(model.mean_reprojection_error_px, 2)),
         fact("median error, pixels", fixed(model.median_reprojection_error_px, 2))),
       job.models.length > 1 && h("p", { class: "muted small" }, `The pictures fall into ${plural(job.models.length, "separate model")}: nothing ties them together. Each can be seen above and downloaded.`));

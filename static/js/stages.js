@@ -22,6 +22,14 @@ function tookOf(job) {
   return `Took ${duration((new Date(job.finished_at) - new Date(job.started_at)) / 1000)}: the stages`;
 }
 
+/** The share of a running job's time that is over, by the middle of the guess of the rest. */
+function shareDone(job) {
+  if (!job.eta_s || !job.started_at) return 0;
+  const elapsed_s = (Date.now() - new Date(job.started_at)) / 1000;
+  const left_s = (job.eta_s.low + job.eta_s.high) / 2;
+  return elapsed_s > 0 ? elapsed_s / (elapsed_s + left_s) : 0;
+}
+
 export function stagePanel() {
   const overall = h("div", { class: "overall" });
   const list = h("ol", { class: "stages" });
@@ -30,6 +38,7 @@ export function stagePanel() {
   const element = h("section", { class: "card", "aria-label": "Progress" }, overall, details);
   const rows = new Map();
   let wasOver = null;
+  let furthest = 0;
 
   function show(job) {
     const over = isOver(job);
@@ -67,10 +76,7 @@ export function stagePanel() {
       fill(overall, h("p", {}, "Waiting for its turn: jobs run one after another."));
       return;
     }
-    const finished = job.stages.filter((s) => s.state === "done" || s.state === "reused").length;
     const now = job.stage;
-    const part = now?.total ? now.done / now.total : 0;
-    const done = job.stages.length > 0 ? (finished + part) / job.stages.length : 0;
     const text = now ? `${stageName(now)}${now.total ? `: ${count(now.done)} of ${count(now.total)}` : ""}` : "Starting";
     const left = timeLeft(job.eta_s);
     let bar = overall.querySelector("progress");
@@ -79,7 +85,9 @@ export function stagePanel() {
       bar = overall.querySelector("progress");
     }
     overall.querySelector("p").textContent = left ? `${text} \u00b7 ${left}` : text;
-    bar.value = done;
+    // By time, not by stages, which differ in length; never backwards, although the guess of the rest may grow.
+    furthest = Math.max(furthest, shareDone(job));
+    bar.value = furthest;
   }
 
   return { element, show };

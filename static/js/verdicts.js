@@ -10,10 +10,14 @@ export function verdicts(job) {
   const list = h("ul", { class: "verdicts" });
   const note = h("p", { class: "muted", hidden: true });
   const more = h("button", { type: "button", hidden: true }, "Show more");
-  const filters = [[null, "all", uploaded], ["registered", STATES.registered, registered], ["unregistered", STATES.unregistered, unregistered], ["rejected", STATES.rejected, rejected]]
-    .filter(([state, , n]) => state === null || (n ?? 0) > 0)
-    .map(([state, label, n]) => h("button", { type: "button", class: "slim", "aria-pressed": "false", "data-state": state ?? "", onclick: () => choose(state) }, `${label} ${count(n)}`));
-  let state = null;
+  // What can be shown: a label, how many, and the states, listed one after the other; none means all, by name.
+  const views = [
+    ["all", uploaded, []],
+    [STATES.registered, registered, ["registered"]],
+    ["not in a model", out, ["unregistered", "rejected"]],
+  ].filter(([label, n]) => label === "all" || (n ?? 0) > 0);
+  const buttons = views.map((view) => h("button", { type: "button", class: "slim", "aria-pressed": "false", onclick: () => choose(view) }, `${view[0]} ${count(view[1])}`));
+  let waiting = [];
   let cursor = null;
   let asked = 0;
 
@@ -21,15 +25,19 @@ export function verdicts(job) {
     const mine = asked;
     more.disabled = true;
     try {
-      const page = await jobImages(job, cursor, state);
-      // Another filter was chosen meanwhile.
-      if (mine !== asked) return;
-      list.append(...page.images.map(card));
-      cursor = page.next_cursor;
-      more.hidden = !cursor;
-      note.hidden = page.total > 0;
+      do {
+        const page = await jobImages(job, cursor, waiting[0]);
+        // Another view was chosen meanwhile.
+        if (mine !== asked) return;
+        list.append(...page.images.map(card));
+        cursor = page.next_cursor;
+        if (!cursor) waiting.shift();
+      } while (waiting.length > 0 && !cursor);
+      more.hidden = waiting.length === 0;
+      note.hidden = list.childElementCount > 0;
       note.textContent = "None.";
     } catch (problem) {
+      if (mine !== asked) return;
       note.hidden = false;
       note.textContent = problem.message;
       more.hidden = false;
@@ -37,22 +45,22 @@ export function verdicts(job) {
     more.disabled = false;
   }
 
-  function choose(next) {
-    state = next;
+  function choose(view) {
+    waiting = view[2].length > 0 ? [...view[2]] : [null];
     cursor = null;
     asked += 1;
     fill(list);
-    for (const button of filters) button.setAttribute("aria-pressed", String(button.dataset.state === (state ?? "")));
+    buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(views[k] === view)));
     load();
   }
   more.addEventListener("click", load);
   // Pictures that need something done are what a person looks for first.
-  choose(out > 0 && out < (registered ?? 0) ? ((unregistered ?? 0) > 0 ? "unregistered" : "rejected") : null);
+  choose(out > 0 && out < (uploaded ?? 0) ? views[views.length - 1] : views[0]);
 
   return h("section", { class: "card", "aria-labelledby": "verdicts-title" },
     h("div", { class: "section-head" }, h("h2", { id: "verdicts-title" }, "Pictures"),
       h("span", { class: "muted" }, job.state === "succeeded" ? (out === 0 ? "Every one is in the model." : `${plural(out, "picture is", "pictures are")} not in a model.`) : null)),
-    h("div", { class: "filter", role: "group", "aria-label": "Show" }, filters),
+    h("div", { class: "filter", role: "group", "aria-label": "Show" }, buttons),
     note, list, h("div", { class: "row" }, more));
 }
 

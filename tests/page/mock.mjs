@@ -162,7 +162,8 @@ export async function startMock({ stage_ms = 300, fail = () => undefined, models
       }
       if (rest.endsWith("/thumbnail")) {
         const n = Number(rest.split("/")[2]);
-        return send("image/svg+xml", Buffer.from(`<svg xmlns="http://www.w3.org/2000/svg" width="320" height="240"><rect width="320" height="240" fill="hsl(${(n * 47) % 360} 25% 65%)"/><path d="M0 200 90 110l60 50 80-90 90 130v40H0z" fill="hsl(${(n * 47) % 360} 20% 42%)"/></svg>`));
+        const [width, height] = n % 2 ? [240, 320] : [320, 240];
+        return send("image/svg+xml", Buffer.from(`<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}" viewBox="0 0 320 240" preserveAspectRatio="xMidYMid slice"><rect width="320" height="240" fill="hsl(${(n * 47) % 360} 25% 65%)"/><path d="M0 200 90 110l60 50 80-90 90 130v40H0z" fill="hsl(${(n * 47) % 360} 20% 42%)"/></svg>`));
       }
       const outputs = { "ply/0/cameras.ply": () => camerasPly(Math.max(0, files.size - 2)), "ply/0/points.ply": pointsPly, "ply/1/cameras.ply": () => camerasPly(Math.max(0, files.size - 2)), "ply/1/points.ply": pointsPly, "report.html": () => Buffer.from("<!doctype html><title>Report</title>"), "report.json": () => Buffer.from(JSON.stringify({ notes: ["The scale is arbitrary: no photograph says where it was taken."] })), "sparse/0/images.bin": () => Buffer.alloc(5000) };
       if (rest === "/outputs") {

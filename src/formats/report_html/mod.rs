@@ -34,8 +34,9 @@ pub fn write(
     for (account, model) in report.models.iter().zip(models) {
         page::model(report, account, model, out)?;
     }
+    page::images_left_out(report, thumbnails, out)?;
     page::stages(report, out)?;
-    page::images(report, thumbnails, out)?;
+    page::images_placed(report, thumbnails, out)?;
     page::settings(report, out)?;
     out.write_all(b"</main></body></html>\n")
 }

@@ -14,7 +14,7 @@ pub(super) fn head(report: &Report, out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "<h1>{}</h1>", if models.is_empty() { "No model was found" } else { "Reconstruction report" })?;
     writeln!(
         out,
-        "<p class=\"soft\">{} {} &middot; {} photographs of {:.1} megapixels in all</p>\n<div class=\"tiles\">",
+        "<p class=\"soft\">{} {} &middot; {} files, {:.1} megapixels in all</p>\n<div class=\"tiles\">",
         Escaped(&software.name),
         Escaped(&software.version),
         Grouped(input.images),
@@ -173,25 +173,41 @@ pub(super) fn stages(report: &Report, out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "</table></div>")
 }
 
-/// A card for each photograph: those that were left out first.
-pub(super) fn images(report: &Report, thumbnails: &BTreeMap<String, Vec<u8>>, out: &mut impl Write) -> io::Result<()> {
-    let (placed, left_out): (Vec<_>, Vec<_>) =
-        report.images.iter().partition(|image| image.state == ImageState::Registered);
-    for (title, images) in [("Photographs left out", left_out), ("Photographs placed", placed)] {
-        if images.is_empty() {
-            continue;
-        }
-        writeln!(
-            out,
-            "<h2>{title} <span class=\"soft\">({})</span></h2>\n<div class=\"grid\">",
-            Grouped(images.len())
-        )?;
-        for image in images {
-            card(image, thumbnails.get(&image.name), out)?;
-        }
-        writeln!(out, "</div>")?;
+/// A card for each photograph that is in no model, with what to do about it.
+pub(super) fn images_left_out(
+    report: &Report,
+    thumbnails: &BTreeMap<String, Vec<u8>>,
+    out: &mut impl Write,
+) -> io::Result<()> {
+    cards("Photographs left out", report, |image| image.state != ImageState::Registered, thumbnails, out)
+}
+
+/// A card for each photograph that is in a model.
+pub(super) fn images_placed(
+    report: &Report,
+    thumbnails: &BTreeMap<String, Vec<u8>>,
+    out: &mut impl Write,
+) -> io::Result<()> {
+    cards("Photographs placed", report, |image| image.state == ImageState::Registered, thumbnails, out)
+}
+
+/// A section of cards, unless there is none.
+fn cards(
+    title: &str,
+    report: &Report,
+    belongs: impl Fn(&ImageReport) -> bool,
+    thumbnails: &BTreeMap<String, Vec<u8>>,
+    out: &mut impl Write,
+) -> io::Result<()> {
+    let images: Vec<&ImageReport> = report.images.iter().filter(|image| belongs(image)).collect();
+    if images.is_empty() {
+        return Ok(());
     }
-    Ok(())
+    writeln!(out, "<h2>{title} <span class=\"soft\">({})</span></h2>\n<div class=\"grid\">", Grouped(images.len()))?;
+    for image in images {
+        card(image, thumbnails.get(&image.name), out)?;
+    }
+    writeln!(out, "</div>")
 }
 
 fn card(image: &ImageReport, thumbnail: Option<&Vec<u8>>, out: &mut impl Write) -> io::Result<()> {

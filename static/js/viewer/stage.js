@@ -7,9 +7,13 @@ const FIT_SAMPLE = 20000;
 /** Share of the points that must be in view: a distant background must not shrink the object ... */
 const FIT_SHARE = 0.75;
 /** ... and the room around them, as a factor. */
-const FIT_MARGIN = 1.3;
+const FIT_MARGIN = 1.15;
 /** How far above the ground the view starts: as the cameras, within limits; `usual` where they stand all round. */
 const FIT_ELEVATION_RAD = { lowest: 0.15, usual: 0.35, highest: 1.1 };
+/** Cameras on one side of the object are looked at from this far round, so that they and the object stand apart. */
+const FIT_AZIMUTH_RAD = 0.5;
+/** The sphere in view may be this much larger than the object's own, to have the cameras in it. */
+const FIT_GROWTH = 1.9;
 
 const VERTEX = `
   attribute vec3 tint;
@@ -138,29 +142,35 @@ export class Stage {
     this.fit();
   }
 
-  /** Brings the model into view, looked at from behind the cameras that took it. */
+  /** Brings the model and, as far as that leaves it large enough, its cameras into view. */
   fit() {
     if (!this.cloud) return;
     const { three } = this;
     this.model.updateMatrixWorld(true);
     const { middle, reach } = bulkOf(this.cloud.positions);
     const centre = new three.Vector3(...middle).applyMatrix4(this.model.matrixWorld);
-    const narrow = Math.min(1, this.camera.aspect);
-    let distance = (FIT_MARGIN * reach) / (Math.sin((FOV_DEG * Math.PI) / 360) * narrow);
     const toward = new three.Vector3(0.6, 0, 1);
     let elevation = FIT_ELEVATION_RAD.usual;
+    let radius = reach;
     if (this.cameras && this.cameras.positions.length > 0) {
       const cameras = bulkOf(this.cameras.positions);
       const from = new three.Vector3(...cameras.middle).applyMatrix4(this.model.matrixWorld).sub(centre);
+      // The smallest sphere around both, its middle on the line between them, unless the object would be lost in it.
+      const both = Math.min(0.5 * (from.length() + reach + cameras.reach), FIT_GROWTH * reach);
+      radius = Math.max(reach, cameras.reach > from.length() ? Math.min(cameras.reach, FIT_GROWTH * reach) : both);
       // Cameras all round the object have their middle near its own: then any side is as good.
       if (from.length() > 0.6 * cameras.reach) {
         const { lowest, highest } = FIT_ELEVATION_RAD;
         elevation = Math.min(highest, Math.max(lowest, Math.atan2(from.y, Math.hypot(from.x, from.z))));
-        if (Math.hypot(from.x, from.z) > 0.05 * from.length()) toward.set(from.x, 0, from.z);
+        if (Math.hypot(from.x, from.z) > 0.05 * from.length()) {
+          const azimuth = Math.atan2(from.x, from.z) + FIT_AZIMUTH_RAD;
+          toward.set(Math.sin(azimuth), 0, Math.cos(azimuth));
+        }
+        centre.addScaledVector(from.normalize(), Math.max(0, radius - reach));
       }
-      // From behind the cameras they are in view themselves, unless that would leave the model small.
-      distance = Math.max(distance, Math.min(1.3 * (from.length() + 0.5 * cameras.reach), 2 * distance));
     }
+    const narrow = Math.min(1, this.camera.aspect);
+    const distance = (FIT_MARGIN * radius) / (Math.sin((FOV_DEG * Math.PI) / 360) * narrow);
     toward.normalize().multiplyScalar(Math.cos(elevation));
     toward.y = Math.sin(elevation);
     this.camera.near = distance / 500;
