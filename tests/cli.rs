@@ -2,12 +2,20 @@
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "cli/bad_pictures.rs"]
+mod bad_pictures;
+#[path = "cli/determinism.rs"]
+mod determinism;
 #[path = "cli/evaluate.rs"]
 mod evaluate;
 #[path = "cli/reconstruct.rs"]
 mod reconstruct;
+#[path = "cli/rendered.rs"]
+mod rendered;
 #[path = "cli/synthesize.rs"]
 mod synthesize;
+#[path = "cli/zoomed.rs"]
+mod zoomed;
 
 use std::process::{Command, Output};
 

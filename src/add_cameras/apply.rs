@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::pose::{pixel, place};
+use super::pose::{Intrinsics, pixel, place};
 use super::{LoadFeatures, LocalizeFailure, Localized, PoseOptions};
 use crate::camera::{Camera, FocalSource, Pixel};
+use crate::coarse::add_camera;
 use crate::math::Rng;
 use crate::scene::{CameraId, Features, ImageId, KeypointIdx, Observation, Reconstruction};
 
@@ -44,21 +45,25 @@ pub fn apply(
             continue;
         }
         let features = features(id);
-        let shared = &model.cameras[&found.camera_id];
-        let (pose, inliers) = if shared.params == found.camera.params {
-            (found.cam_from_world, found.inliers.clone())
-        } else {
-            let fixed = Camera { focal_source: FocalSource::Known, ..shared.clone() };
-            let mut rng = Rng::from_parts(&[seed, STREAM, u64::from(id.0)]);
-            match place(model, &features, &fixed, &found.inliers, found.method, options, &mut rng) {
-                Ok((pose, inliers)) => (pose.cam_from_world, inliers),
-                Err(failure) => {
-                    report.rejected.insert(id, failure);
-                    continue;
+        let (camera, pose, inliers) = match found.camera_id {
+            None => (add_camera(model, found.camera.clone()), found.cam_from_world, found.inliers.clone()),
+            Some(camera) if model.cameras[&camera].params == found.camera.params => {
+                (camera, found.cam_from_world, found.inliers.clone())
+            }
+            Some(camera) => {
+                let fixed = [Camera { focal_source: FocalSource::Known, ..model.cameras[&camera].clone() }];
+                let mut rng = Rng::from_parts(&[seed, STREAM, u64::from(id.0)]);
+                let intrinsics = Intrinsics::Shared(&fixed);
+                match place(model, &features, &intrinsics, &found.inliers, found.method, options, &mut rng) {
+                    Ok(placed) => (camera, placed.pose.cam_from_world, placed.inliers),
+                    Err(failure) => {
+                        report.rejected.insert(id, failure);
+                        continue;
+                    }
                 }
             }
         };
-        model.register(id, found.camera_id, pose, pixels(&features));
+        model.register(id, camera, pose, pixels(&features));
         report.images_added += 1;
         for seen in inliers {
             let observation = Observation { image: id, keypoint: seen.keypoint };
@@ -74,9 +79,10 @@ pub fn apply(
 fn settle_cameras(model: &Reconstruction, localized: &BTreeMap<ImageId, Localized>) -> BTreeMap<CameraId, Camera> {
     let mut best: BTreeMap<CameraId, &Localized> = BTreeMap::new();
     for found in localized.values() {
-        let used = model.images().values().any(|image| image.camera == found.camera_id);
-        if !used && best.get(&found.camera_id).is_none_or(|best| found.inliers.len() > best.inliers.len()) {
-            best.insert(found.camera_id, found);
+        let Some(camera) = found.camera_id else { continue };
+        let used = model.images().values().any(|image| image.camera == camera);
+        if !used && best.get(&camera).is_none_or(|best| found.inliers.len() > best.inliers.len()) {
+            best.insert(camera, found);
         }
     }
     best.into_iter().map(|(id, found)| (id, found.camera.clone())).collect()

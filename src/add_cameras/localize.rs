@@ -8,13 +8,14 @@ use serde::{Deserialize, Serialize};
 
 use super::active_search::active_search;
 use super::direct_match::direct_match;
-use super::pose::place;
+use super::pose::{Intrinsics, place};
 use super::ranked_match::{ranked_images, ranked_match};
 use super::{
     AddCamerasCancelled, AddCamerasOptions, Cancelled, Correspondence, LoadFeatures, LocalizationMethod,
     LocalizeFailure, MatchCounts, ModelSnapshot, Progress,
 };
-use crate::camera::{Camera, FocalSource};
+use crate::camera::Camera;
+use crate::coarse::cameras_to_share;
 use crate::geometry::Rigid3;
 use crate::math::Rng;
 use crate::scene::{CameraId, Features, ImageId, Reconstruction};
@@ -36,8 +37,9 @@ pub struct QueryImage {
 /// A localised image.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Localized {
-    /// Its camera.
-    pub camera_id: CameraId,
+    /// The camera of the model it shares, or that of its group where no image of the model has it yet; none where it needs one
+    /// of its own.
+    pub camera_id: Option<CameraId>,
     /// The intrinsics its pose belongs to.
     pub camera: Camera,
     /// Its pose.
@@ -48,15 +50,6 @@ pub struct Localized {
     pub num_correspondences: usize,
     /// What found them.
     pub method: LocalizationMethod,
-}
-
-/// The intrinsics an image is localised with: those of the model, and fixed, when images of the model share them.
-fn intrinsics(model: &Reconstruction, query: &QueryImage) -> Camera {
-    let mut camera = model.cameras.get(&query.camera_id).unwrap_or(&query.camera).clone();
-    if model.images().values().any(|image| image.camera == query.camera_id) {
-        camera.focal_source = FocalSource::Known;
-    }
-    camera
 }
 
 /// Localises an image: each method in turn until one gives a pose that is accepted.
@@ -80,7 +73,10 @@ pub fn localize_image(
     if snapshot.is_empty() {
         return Err(LocalizeFailure::EmptyModel);
     }
-    let camera = intrinsics(model, query);
+    let shareable =
+        cameras_to_share(model, query.camera_id, model.cameras.get(&query.camera_id).unwrap_or(&query.camera));
+    let cameras: Vec<Camera> = shareable.iter().map(|id| model.cameras[id].clone()).collect();
+    let intrinsics = if cameras.is_empty() { Intrinsics::Unused(&query.camera) } else { Intrinsics::Shared(&cameras) };
     let mut failure: Option<LocalizeFailure> = None;
     for (turn, &method) in (0u64..).zip(&options.methods) {
         let correspondences = match method {
@@ -96,13 +92,14 @@ pub fn localize_image(
             pose_options.min_correspondences = pose_options.min_correspondences.max(options.ranked_match.more_than + 1);
         }
         let mut rng = Rng::from_parts(&[seed, STREAM, u64::from(query.image.0), turn]);
-        match place(model, features, &camera, &correspondences, method, &pose_options, &mut rng) {
-            Ok((pose, inliers)) => {
+        match place(model, features, &intrinsics, &correspondences, method, &pose_options, &mut rng) {
+            Ok(placed) => {
+                let group = cameras.is_empty().then_some(query.camera_id);
                 return Ok(Localized {
-                    camera_id: query.camera_id,
-                    camera: pose.camera,
-                    cam_from_world: pose.cam_from_world,
-                    inliers,
+                    camera_id: placed.shares.map(|at| shareable[at]).or(group),
+                    camera: placed.pose.camera,
+                    cam_from_world: placed.pose.cam_from_world,
+                    inliers: placed.inliers,
                     num_correspondences: correspondences.len(),
                     method,
                 });

@@ -6,7 +6,7 @@ use super::correspondences::Correspondence;
 use super::{LocalizationMethod, PoseOptions};
 use crate::camera::{Camera, Pixel};
 use crate::math::Rng;
-use crate::ransac::absolute_pose::{AbsolutePose, AbsolutePoseOptions, estimate};
+use crate::ransac::absolute_pose::{AbsolutePose, AbsolutePoseOptions, SharedPose, estimate, estimate_sharing};
 use crate::scene::{Features, KeypointIdx, Reconstruction};
 
 /// Why an image could not be localised: how far the method came that came farthest.
@@ -59,16 +59,34 @@ impl LocalizeFailure {
 /// A pose below this many inliers is not told apart from none.
 const FEWEST_INLIERS: usize = 6;
 
-/// The pose by these correspondences, and those that agree with it.
+/// What is known of the intrinsics of an image.
+pub(super) enum Intrinsics<'a> {
+    /// It shares one of these cameras of the model, unless the correspondences say that none fits.
+    Shared(&'a [Camera]),
+    /// No image of the model has its camera; this is the start.
+    Unused(&'a Camera),
+}
+
+/// An image in place and the correspondences that agree.
+pub(super) struct Placed {
+    /// Its pose and intrinsics.
+    pub pose: AbsolutePose,
+    /// Which of the given cameras it shares; none where it has intrinsics of its own.
+    pub shares: Option<usize>,
+    /// The correspondences that agree.
+    pub inliers: Vec<Correspondence>,
+}
+
+/// The pose by these correspondences.
 pub(super) fn place(
     model: &Reconstruction,
     features: &Features,
-    camera: &Camera,
+    intrinsics: &Intrinsics<'_>,
     correspondences: &[Correspondence],
     method: LocalizationMethod,
     options: &PoseOptions,
     rng: &mut Rng,
-) -> Result<(AbsolutePose, Vec<Correspondence>), LocalizeFailure> {
+) -> Result<Placed, LocalizeFailure> {
     let known: Vec<_> = correspondences
         .iter()
         .filter_map(|seen| Some((model.point(seen.point)?.xyz, pixel(features, seen.keypoint), *seen)))
@@ -82,16 +100,21 @@ pub(super) fn place(
     // Accepted here, not there, so that a failure can say how many inliers there were.
     let estimation =
         AbsolutePoseOptions { min_inliers: FEWEST_INLIERS, min_inlier_ratio: 0.0, ..options.estimation.clone() };
-    let found = estimate(&points, &pixels, camera, &estimation, rng);
+    let found = match intrinsics {
+        Intrinsics::Shared(cameras) => estimate_sharing(&points, &pixels, cameras, &estimation, rng),
+        Intrinsics::Unused(camera) => {
+            estimate(&points, &pixels, camera, &estimation, rng).map(|pose| SharedPose { pose, shares: None })
+        }
+    };
     let needed = options.min_inliers.max((options.min_inlier_ratio * known.len() as f64).ceil() as usize);
     match found {
-        Some(pose) if pose.num_inliers >= needed => {
-            let agreeing =
-                known.iter().zip(&pose.inliers).filter(|(_, inlier)| **inlier).map(|((_, _, seen), _)| *seen).collect();
-            Ok((pose, agreeing))
+        Some(placed) if placed.pose.num_inliers >= needed => {
+            let agreeing = known.iter().zip(&placed.pose.inliers).filter(|(_, inlier)| **inlier);
+            let inliers = agreeing.map(|((_, _, seen), _)| *seen).collect();
+            Ok(Placed { pose: placed.pose, shares: placed.shares, inliers })
         }
         other => {
-            let inliers = other.map_or(0, |pose| pose.num_inliers);
+            let inliers = other.map_or(0, |placed| placed.pose.num_inliers);
             Err(LocalizeFailure::TooFewInliers { inliers, correspondences: known.len(), needed, method })
         }
     }

@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::bundle::FreeIntrinsics;
-use crate::camera::{CameraModel, FocalSource};
-use crate::scene::{CameraId, Reconstruction};
+use crate::camera::{Camera, CameraModel, FocalSource};
+use crate::scene::{CameraId, ImageId, Reconstruction};
 
 /// How many images sharing a camera it takes to free its parameters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -31,6 +31,8 @@ pub struct IntrinsicsOptions {
     pub min_images_for_opencv: Option<usize>,
     /// Whether intrinsics are refined at all (known ones never are).
     pub refine: bool,
+    /// Share up to which the focal lengths of two cameras of one image size, neither from EXIF, agree: they are one camera.
+    pub agreeing_focal_difference: f64,
 }
 
 /// Where the principal point is.
@@ -72,6 +74,7 @@ impl Default for IntrinsicsOptions {
             min_images_for_radial: 4,
             min_images_for_opencv: None,
             refine: true,
+            agreeing_focal_difference: 0.04,
         }
     }
 }
@@ -91,6 +94,61 @@ pub fn free_intrinsics(model: &Reconstruction, options: &IntrinsicsOptions) -> B
         }
     };
     sharing(model).into_iter().map(|(id, sharing)| (id, free(id, sharing))).collect()
+}
+
+/// Whether nothing but the photographs told a camera's focal length, so that images may be moved to it and away from it.
+pub(super) fn is_told_by_photographs(camera: &Camera) -> bool {
+    matches!(camera.focal_source, FocalSource::Guess | FocalSource::Estimated)
+}
+
+/// The cameras that an image of the group `group` may share, in id order: the group's own, and, where no EXIF told it, all of
+/// its size that images were split off to. Only cameras in use.
+pub fn cameras_to_share(model: &Reconstruction, group: CameraId, given: &Camera) -> Vec<CameraId> {
+    let told = is_told_by_photographs(given);
+    let fits = |id: &CameraId| {
+        let camera = &model.cameras[id];
+        let same_size = (camera.width, camera.height) == (given.width, given.height);
+        *id == group || (told && same_size && is_told_by_photographs(camera))
+    };
+    sharing(model).into_keys().filter(fits).collect()
+}
+
+/// Adds a camera to a model and returns its id, which is new.
+pub fn add_camera(model: &mut Reconstruction, camera: Camera) -> CameraId {
+    let id = model.cameras.last_key_value().map_or(CameraId(0), |(last, _)| CameraId(last.0 + 1));
+    model.cameras.insert(id, camera);
+    id
+}
+
+/// Makes cameras of one size whose focal lengths agree, and that no EXIF told, into one: that of most images. Returns how many
+/// cameras went.
+pub fn merge_agreeing_cameras(model: &mut Reconstruction, options: &IntrinsicsOptions) -> usize {
+    let mut uses: Vec<(CameraId, usize)> = sharing(model).into_iter().collect();
+    uses.sort_by_key(|&(id, images)| (std::cmp::Reverse(images), id));
+    let mut kept: Vec<CameraId> = Vec::new();
+    let mut merged = 0;
+    for (id, _) in uses {
+        let camera = &model.cameras[&id];
+        let agrees = |other: &&CameraId| {
+            let other = &model.cameras[*other];
+            (other.width, other.height) == (camera.width, camera.height)
+                && is_told_by_photographs(other)
+                && is_told_by_photographs(camera)
+                && (other.mean_focal_px() / camera.mean_focal_px()).ln().abs()
+                    <= options.agreeing_focal_difference.ln_1p()
+        };
+        let Some(&into) = kept.iter().find(agrees) else {
+            kept.push(id);
+            continue;
+        };
+        let users: Vec<ImageId> =
+            model.images().iter().filter(|(_, image)| image.camera == id).map(|(&image, _)| image).collect();
+        for image in users {
+            model.set_camera(image, into);
+        }
+        merged += 1;
+    }
+    merged
 }
 
 /// How many images of a model use each camera.

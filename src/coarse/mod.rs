@@ -11,7 +11,9 @@ pub mod selection;
 mod tracks;
 
 pub use filter::{KeepLimits, filter};
-pub use intrinsics::{IntrinsicsOptions, PrincipalPoint, free_intrinsics};
+pub use intrinsics::{
+    IntrinsicsOptions, PrincipalPoint, add_camera, cameras_to_share, free_intrinsics, merge_agreeing_cameras,
+};
 pub use mapper::{CoarseModels, MapperImage, MapperInput, MapperOptions, Unregistered, reconstruct};
 pub use match_graph::MatchGraph;
 pub use tracks::Tracks;

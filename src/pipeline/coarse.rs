@@ -113,8 +113,10 @@ pub fn run(
             break;
         }
         notes.push(format!(
-            "With the {:.0} % of the features of largest scale, {reached} of {usable} photographs came into the largest coarse model.",
-            selection.eta_percent
+            "The {:.0} % of the features of largest scale brought {reached} of {usable} photographs into the largest coarse \
+             model{}.",
+            selection.eta_percent,
+            if selection.widened().is_some() { "; a larger share was tried after that" } else { ", and these are all features" }
         ));
     }
     let models = best.map(|(_, models)| models).unwrap_or_default();
@@ -125,9 +127,24 @@ pub fn run(
             .map(|model| ModelState { model, registered_in: BTreeMap::new(), history: Vec::new() })
             .collect(),
         unregistered: models.unregistered,
+        most_alike: most_alike(&before.graph),
     };
     state.record(key(Stage::CoarseModel));
     Ok(Coarse { state, match_counts: before.match_counts, cameras: before.cameras })
+}
+
+/// The image that each image shares most verified matches with; of equals the first.
+fn most_alike(graph: &MatchGraph) -> BTreeMap<ImageId, ImageId> {
+    let mut best: BTreeMap<ImageId, (usize, ImageId)> = BTreeMap::new();
+    for (&(a, b), geometry) in &graph.pairs {
+        for (image, other) in [(a, b), (b, a)] {
+            let inliers = geometry.inliers.len();
+            if best.get(&image).is_none_or(|(most, _)| inliers > *most) {
+                best.insert(image, (inliers, other));
+            }
+        }
+    }
+    best.into_iter().map(|(image, (_, other))| (image, other)).collect()
 }
 
 fn registered(models: &CoarseModels) -> usize {
@@ -295,9 +312,13 @@ impl Matcher<'_> {
             .map(|&(a, b)| self.verify((a, b), (&images[&a], &images[&b]), &graph.pairs[&(a, b)].inliers, &cameras))
             .collect();
         for (pair, geometry) in pending.into_iter().zip(verified) {
-            if let Some(geometry) = geometry {
-                graph.pairs.insert(pair, geometry);
+            let Some(mut geometry) = geometry else { continue };
+            let before = graph.pairs.remove(&pair).map(|before| before.inliers).unwrap_or_default();
+            // A wrong focal length (one of both was zoomed) costs matches that the uncalibrated geometry explains.
+            if (geometry.inliers.len() as f64) < self.options.focals.min_calibrated_share * before.len() as f64 {
+                geometry.inliers = before;
             }
+            graph.pairs.insert(pair, geometry);
         }
     }
 }

@@ -24,6 +24,9 @@ pub struct FocalOptions {
     pub exif_tolerance: f64,
     /// Pairs that must have voted.
     pub min_pairs: usize,
+    /// Share of a pair's matches that the geometry by untrusted focal lengths must keep; where it keeps fewer, the matches of
+    /// the uncalibrated geometry stay.
+    pub min_calibrated_share: f64,
 }
 
 impl Default for FocalOptions {
@@ -34,6 +37,7 @@ impl Default for FocalOptions {
             min_confidence_over_exif: 0.3,
             exif_tolerance: 1.4,
             min_pairs: 3,
+            min_calibrated_share: 0.7,
         }
     }
 }

@@ -89,10 +89,14 @@ impl Localiser<'_> {
     }
 }
 
-/// The verdict a failure amounts to.
+/// Share of the inliers a pose needs from which on it nearly worked. Fewer agree by chance, in any picture, and say nothing.
+const NEARLY: f64 = 0.5;
+
+/// The verdict a failure amounts to; none where it says no more than is known already.
 fn reason(failure: &LocalizeFailure) -> Option<Unregistered> {
     match *failure {
         LocalizeFailure::NoFeatures | LocalizeFailure::EmptyModel => None,
+        LocalizeFailure::TooFewInliers { inliers, needed, .. } if (inliers as f64) < NEARLY * needed as f64 => None,
         LocalizeFailure::TooFewCorrespondences { found: visible, .. } => Some(Unregistered::TooFewPoints { visible }),
         LocalizeFailure::TooFewInliers { inliers, correspondences: visible, .. } => {
             Some(Unregistered::PoseFailed { visible, inliers })

@@ -2,12 +2,13 @@
 
 use super::options::ReconstructionOptions;
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
-use crate::coarse::{filter, free_intrinsics};
+use crate::coarse::{filter, free_intrinsics, merge_agreeing_cameras};
 use crate::scene::{Point3dId, Reconstruction};
 
 /// Refines a model in place.
 pub fn refine(model: &mut Reconstruction, options: &ReconstructionOptions) {
     for _ in 0..options.refine.rounds {
+        merge_agreeing_cameras(model, &options.coarse.mapper.intrinsics);
         let mut config = BundleConfig::global(model, FreeIntrinsics::default());
         config.intrinsics = free_intrinsics(model, &options.coarse.mapper.intrinsics);
         bundle::adjust(model, &config, &options.refine.bundle);

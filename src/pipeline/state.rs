@@ -27,6 +27,8 @@ pub struct PipelineState {
     pub models: Vec<ModelState>,
     /// Why each image is in no model.
     pub unregistered: BTreeMap<ImageId, Unregistered>,
+    /// The image that each image shares most verified coarse matches with, where it shares any.
+    pub most_alike: BTreeMap<ImageId, ImageId>,
 }
 
 impl PipelineState {

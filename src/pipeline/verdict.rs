@@ -12,6 +12,9 @@ use crate::scene::ImageId;
 /// Features below which a picture is called featureless: too few for any pair to be verified.
 const FEW_FEATURES: usize = 50;
 
+/// Likenesses of a picture's features with points of the model from which on it is worth saying why they may mislead.
+const MANY_LIKENESSES: usize = 30;
+
 /// Why an image has no pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Reason {
@@ -61,7 +64,9 @@ pub fn verdicts(
             } else if let Some(&model) = located.get(&id) {
                 registered(&mut report, id, model, state);
             } else {
-                let reason = reason(id, report.features.unwrap_or(0), state);
+                let most_alike = state.most_alike.get(&id).map(|&other| intake.name(other));
+                let why = state.unregistered.get(&id).unwrap_or(&Unregistered::NoPairs);
+                let reason = reason(report.features.unwrap_or(0), why, most_alike);
                 report.state = ImageState::Unregistered;
                 report.reason = Some(reason.code.to_owned());
                 report.advice = Some(reason.advice);
@@ -91,23 +96,27 @@ fn registered(report: &mut ImageReport, id: ImageId, model: usize, state: &Pipel
     report.focal_px = Some(account.model.camera_of(id).mean_focal_px());
 }
 
-fn reason(id: ImageId, features: usize, state: &PipelineState) -> Reason {
+/// The reason for a picture with so many features; `most_alike` is the name of the one it matches best.
+fn reason(features: usize, why: &Unregistered, most_alike: Option<&str>) -> Reason {
     if features < FEW_FEATURES {
-        return Reason {
-            code: "too_few_features",
-            advice: format!(
-                "Only {features} distinctive spots were found: the picture is too dark, blurred or plain. \
-                 Take it again in even light and in focus."
-            ),
+        let found = match features {
+            0 => "No distinctive spot was found: the picture is black, overexposed, blurred or plain.".to_owned(),
+            few => format!("Only {few} distinctive spots were found: the picture is too dark, blurred or plain."),
         };
+        let advice = format!("{found} Take it again in even light and in focus.");
+        return Reason { code: "too_few_features", advice };
     }
-    match state.unregistered.get(&id).unwrap_or(&Unregistered::NoPairs) {
+    let lead_over = match most_alike {
+        Some(name) => format!("It matches {name} best: add photographs taken between the two."),
+        None => "Add photographs that lead over from the model to it.".to_owned(),
+    };
+    match *why {
         Unregistered::NoPairs => Reason {
             code: "no_matching_image",
-            advice:
-                "It shows nothing that another photograph shows as well. If it belongs here, add photographs taken \
-                     between it and its neighbours, with two thirds overlap."
-                    .to_owned(),
+            advice: "No other photograph matches it: none shows enough of the same place from a similar side and in \
+                     similar light. If it belongs here, add photographs taken between it and its neighbours, with two \
+                     thirds overlap."
+                .to_owned(),
         },
         Unregistered::NoInitialPair => Reason {
             code: "no_initial_pair",
@@ -117,16 +126,51 @@ fn reason(id: ImageId, features: usize, state: &PipelineState) -> Reason {
         },
         Unregistered::TooFewPoints { visible } => Reason {
             code: "too_few_model_points",
-            advice: format!(
-                "It sees only {visible} points of the model. Add photographs that lead over from its neighbours to it."
-            ),
+            advice: match visible {
+                0 => format!("It sees no point of the model. {lead_over}"),
+                1 => format!("It sees only one point of the model. {lead_over}"),
+                few => format!("It sees only {few} points of the model. {lead_over}"),
+            },
         },
         Unregistered::PoseFailed { visible, inliers } => Reason {
             code: "pose_not_found",
-            advice: format!(
-                "It seems to see {visible} points of the model, but no camera position agrees with more than {inliers} of \
-                 them: it may show a look-alike part or something that moved. Add photographs near it."
-            ),
+            advice: {
+                let agree = match inliers {
+                    0 => "no camera position fits them".to_owned(),
+                    few => format!("no camera position fits more than {few} of them"),
+                };
+                let suspicion = if visible >= MANY_LIKENESSES {
+                    " It may show a look-alike part, or something that moved."
+                } else {
+                    ""
+                };
+                format!(
+                    "Of its {features} features {visible} look like points of the model, and {agree}.{suspicion} {lead_over}"
+                )
+            },
         },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn advice_is_specific() {
+        let advice = |features, why: &Unregistered, alike| reason(features, why, alike).advice;
+        let failed = |visible, inliers| Unregistered::PoseFailed { visible, inliers };
+        let few = advice(7000, &failed(14, 0), Some("a/25.jpg"));
+        assert!(few.contains("Of its 7000 features 14 look like"), "{few}");
+        assert!(few.contains("no camera position fits them") && !few.contains("look-alike"), "{few}");
+        assert!(few.ends_with("It matches a/25.jpg best: add photographs taken between the two."), "{few}");
+        let many = advice(7000, &failed(140, 11), None);
+        assert!(many.contains("more than 11 of them") && many.contains("look-alike"), "{many}");
+        assert!(many.ends_with("Add photographs that lead over from the model to it."), "{many}");
+        assert!(advice(7000, &Unregistered::TooFewPoints { visible: 1 }, None).starts_with("It sees only one point"));
+        // Nothing can be said of matches where there is nothing to match.
+        let black = reason(0, &Unregistered::NoPairs, None);
+        assert_eq!(black.code, "too_few_features");
+        assert!(black.advice.starts_with("No distinctive spot was found: the picture is black"), "{}", black.advice);
     }
 }

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::Mapper;
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
 use crate::coarse::filter::filter;
-use crate::coarse::intrinsics::{enrich_cameras, free_intrinsics};
+use crate::coarse::intrinsics::{enrich_cameras, free_intrinsics, merge_agreeing_cameras};
 use crate::scene::{ImageId, Point3dId};
 
 impl Mapper<'_> {
@@ -32,13 +32,16 @@ impl Mapper<'_> {
     pub(super) fn adjust_globally(&mut self) {
         for _ in 0..self.options.global_rounds {
             let before = self.model.num_observations();
+            let split = self.split_cameras();
             let mut config = BundleConfig::global(&self.model, FreeIntrinsics::default());
             config.intrinsics = free_intrinsics(&self.model, &self.options.intrinsics);
             bundle::adjust(&mut self.model, &config, &self.options.global_bundle);
+            let merged = merge_agreeing_cameras(&mut self.model, &self.options.intrinsics);
             let removed = self.filter(None);
             let all: Vec<usize> = (0..self.tracks.tracks.len()).collect();
             let added = self.triangulate_tracks(&all);
-            if ((removed + added) as f64) < self.options.global_change * before as f64 {
+            let settled = ((removed + added) as f64) < self.options.global_change * before as f64;
+            if settled && split == 0 && merged == 0 {
                 break;
             }
         }
@@ -47,6 +50,7 @@ impl Mapper<'_> {
 
     /// Gives every camera the model its images determine and adjusts a last time.
     pub(super) fn finish(&mut self) {
+        self.split_cameras_by_adjustment();
         enrich_cameras(&mut self.model, &self.options.intrinsics);
         self.adjust_globally();
     }

@@ -5,9 +5,12 @@
 //! pyramid score of the next image, retriangulation, iterated adjustment and filtering).
 
 mod adjust;
+mod cameras;
 mod initial;
 mod options;
 mod register;
+#[cfg(test)]
+mod tests;
 mod triangulate;
 
 pub use options::MapperOptions;

@@ -54,6 +54,9 @@ pub struct MapperOptions {
     pub global_bundle: BundleOptions,
     /// Which intrinsics are estimated.
     pub intrinsics: IntrinsicsOptions,
+    /// Share of the points an image should see that it must keep for its pose to count as settled; below, it is placed anew
+    /// to find out whether it shares its camera.
+    pub settled_share: f64,
     /// Share of a component's images a model should reach before other initial pairs are tried.
     pub satisfied_share: f64,
     /// Initial pairs a component is started from at most.
@@ -86,6 +89,7 @@ impl Default for MapperOptions {
             local_bundle: BundleOptions::default(),
             global_bundle: BundleOptions::default(),
             intrinsics: IntrinsicsOptions::default(),
+            settled_share: 0.6,
             satisfied_share: 0.8,
             max_starts: 3,
             min_model_images: 3,

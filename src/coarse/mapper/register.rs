@@ -3,7 +3,8 @@
 use nalgebra::Vector3;
 
 use super::{Mapper, Unregistered};
-use crate::camera::{FocalSource, Pixel};
+use crate::camera::{Camera, Pixel};
+use crate::coarse::intrinsics::{add_camera, cameras_to_share};
 use crate::math::Rng;
 use crate::ransac::absolute_pose;
 use crate::scene::{ImageId, KeypointIdx, Observation, Point3dId};
@@ -82,29 +83,44 @@ impl Mapper<'_> {
         let points: Vec<Vector3<f64>> =
             visible.iter().map(|&(_, id)| self.model.point(id).map(|point| point.xyz).unwrap_or_default()).collect();
         let pixels: Vec<Pixel> = visible.iter().map(|&(keypoint, _)| input.keypoints[keypoint.index()]).collect();
-        let sharing = self.model.images().values().filter(|other| other.camera == input.camera).count();
-        let mut camera = self.model.cameras[&input.camera].clone();
-        if sharing >= 2 {
-            camera.focal_source = camera.focal_source.max(FocalSource::Estimated);
-        }
-        let scale = self.options.keep_limits().threshold_scale(&camera);
+        let own = &self.model.cameras[&input.camera];
+        let shareable = cameras_to_share(&self.model, input.camera, own);
         let mut options = self.options.pose.clone();
-        options.threshold_px *= scale;
+        options.threshold_px *= self.options.keep_limits().threshold_scale(own);
         options.min_inliers = min_inliers;
+        if self.model.images().len() <= self.options.intrinsics.min_model_images_for_focal {
+            // The shared focal length itself may still be a guess: it is no measure of others.
+            options.sharing.min_matches = usize::MAX;
+        }
         let mut rng = Rng::from_parts(&[self.seed, STREAM, u64::from(image.0), u64::from(trial)]);
-        let Some(pose) = absolute_pose::estimate(&points, &pixels, &camera, &options, &mut rng) else {
+        let placed = if shareable.is_empty() {
+            let pose = absolute_pose::estimate(&points, &pixels, own, &options, &mut rng);
+            pose.map(|pose| (Some(input.camera), pose))
+        } else {
+            let cameras: Vec<Camera> = shareable.iter().map(|id| self.model.cameras[id].clone()).collect();
+            let placed = absolute_pose::estimate_sharing(&points, &pixels, &cameras, &options, &mut rng);
+            placed.map(|placed| (placed.shares.map(|at| shareable[at]), placed.pose))
+        };
+        let Some((camera, pose)) = placed else {
             self.failures.insert(image, Unregistered::PoseFailed { visible: visible.len(), inliers: 0 });
             return false;
         };
-        if sharing == 0 {
-            self.model.cameras.insert(input.camera, pose.camera);
-        }
-        self.model.register(image, input.camera, pose.cam_from_world, input.keypoints.clone());
+        let camera = match camera {
+            Some(shared) => {
+                if shareable.is_empty() {
+                    self.model.cameras.insert(shared, pose.camera);
+                }
+                shared
+            }
+            None => add_camera(&mut self.model, pose.camera),
+        };
+        self.model.register(image, camera, pose.cam_from_world, input.keypoints.clone());
+        let max_error_px = self.max_error_px(&self.model.cameras[&camera]);
         for (&(keypoint, point), &inlier) in visible.iter().zip(&pose.inliers) {
             let seen = Observation { image, keypoint };
             if inlier {
                 self.model.add_observation(point, seen);
-                if self.model.reprojection_error_px(point, seen) > self.max_error_px(&camera) {
+                if self.model.reprojection_error_px(point, seen) > max_error_px {
                     self.model.remove_observation(point, seen);
                 }
             }

@@ -6,12 +6,14 @@
 
 mod estimators;
 mod refinement;
+mod sharing;
 
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use self::estimators::{Correspondences, KnownFocal, PinholePose, UnknownFocal};
 use self::refinement::{Free, PlacedCamera, refine};
+pub use self::sharing::{SharedPose, SharingOptions, estimate_sharing, own_camera};
 use super::{RansacOptions, RansacReport, ransac};
 use crate::camera::{Camera, FocalSource, Pixel};
 use crate::geometry::Rigid3;
@@ -44,6 +46,8 @@ pub struct AbsolutePoseOptions {
     pub refine_distortion: bool,
     /// Scale of the Cauchy loss of the refinement, in pixels. (COLMAP: 1.)
     pub loss_px: f64,
+    /// When an image leaves the camera it should share.
+    pub sharing: SharingOptions,
 }
 
 impl Default for AbsolutePoseOptions {
@@ -66,6 +70,7 @@ impl Default for AbsolutePoseOptions {
             refine_trusted_focal: false,
             refine_distortion: false,
             loss_px: 1.0,
+            sharing: SharingOptions::default(),
         }
     }
 }
@@ -74,6 +79,7 @@ impl AbsolutePoseOptions {
     /// Appends what is wrong with the values.
     pub fn validate(&self, errors: &mut Vec<String>) {
         self.ransac.validate(errors);
+        self.sharing.validate(errors);
         for (name, value) in [
             ("threshold_px", self.threshold_px),
             ("loss_px", self.loss_px),
