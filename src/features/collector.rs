@@ -6,6 +6,7 @@ use std::collections::BinaryHeap;
 use crate::scene::{Descriptor, Features, Keypoint};
 
 /// Keeps the features of the `limit` largest scales among those at accepted places.
+#[derive(Clone)]
 pub(super) struct Collector<'a> {
     limit: usize,
     /// Whether a feature at a pixel of the original image may be kept.
@@ -29,6 +30,16 @@ impl<'a> Collector<'a> {
     /// Whether a feature of this scale could still be among those kept, so that describing it is worth while.
     pub(super) fn wants(&self, scale: f32) -> bool {
         self.scales.len() < self.limit || self.scales.peek().is_some_and(|least| scale.to_bits() >= least.0)
+    }
+
+    /// Whether all places are taken by features of at least this scale.
+    pub(super) fn is_full_from(&self, scale: f32) -> bool {
+        self.scales.len() == self.limit && self.scales.peek().is_some_and(|least| least.0 >= scale.to_bits())
+    }
+
+    /// The keypoints found so far.
+    pub(super) fn keypoints(&self) -> impl Iterator<Item = Keypoint> {
+        self.found.iter().map(|(keypoint, _)| *keypoint)
     }
 
     /// Takes a feature.

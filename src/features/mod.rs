@@ -9,7 +9,7 @@
 //! - The doubled image of octave -1 comes from one Gaussian interpolation of the original pixels (`source`) instead of a
 //!   linear interpolation and a blur; it adds no blur of its own and shifts nothing.
 //! - Octave 0 starts from the original image, so the coarse octaves come first and the finest, which costs three times
-//!   the others together, only describes what still fits under the cap (`collector`).
+//!   the others together, only describes what still fits under the cap (`collector`, `forecast`).
 //!
 //! Everything is single precision and single-threaded; the kernels are stamped out for several instruction sets (`simd`)
 //! from one body, whose portable version is the oracle of the others.
@@ -18,6 +18,7 @@ mod blur;
 mod collector;
 mod descriptor;
 mod extrema;
+mod forecast;
 mod gradient;
 mod octave;
 mod options;
@@ -32,12 +33,17 @@ pub use options::SiftOptions;
 
 use crate::scene::{Features, GrayImage};
 use collector::Collector;
+use forecast::Forecast;
 use octave::Octave;
 use simd::Isa;
 use source::Source;
 
 /// Smallest side of an octave in its own pixels; below it no extremum has a neighbourhood worth describing.
 const MIN_OCTAVE_SIDE: usize = 8;
+
+/// Features a pixel that octave 0 may well have. Where that is more than are kept, octave 0 comes after the coarser ones, which
+/// foretell what is worth describing in it; making their first level then costs its first blurs twice.
+const OCTAVE_0_DENSITY: f64 = 0.006;
 
 /// The SIFT features of an image, at most [`SiftOptions::limit`] and those of the largest scales.
 ///
@@ -58,23 +64,35 @@ fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions, keeps: &dyn 
     if image.width == 0 || image.height == 0 || limit == 0 {
         return collector.finish();
     }
-    let mut octave_index = 0;
-    let mut seed = None;
-    loop {
-        let source = match seed.take() {
-            None => Source::original(image, options),
-            Some(plane) => Source::seed(plane),
-        };
-        let (width, height) = source.size();
-        if width.min(height) < MIN_OCTAVE_SIDE {
-            break;
-        }
-        seed = Some(Octave::new(isa, source, octave_index, options).run(&mut collector));
-        octave_index += 1;
+    let octave_0 = || Octave::new(isa, Source::original(image, options), 0, options);
+    let crowded = (image.width * image.height) as f64 * OCTAVE_0_DENSITY > limit as f64;
+    let has_octave_0 = image.width.min(image.height) >= MIN_OCTAVE_SIDE;
+    let mut seed = match (has_octave_0, crowded) {
+        (false, _) => None,
+        (true, true) => Some(octave_0().next_seed()),
+        (true, false) => Some(octave_0().run(&mut collector, None)),
+    };
+    for octave_index in 1.. {
+        let Some(plane) = seed.take().filter(|plane| plane.width.min(plane.height) >= MIN_OCTAVE_SIDE) else { break };
+        seed = Some(Octave::new(isa, Source::seed(plane), octave_index, options).run(&mut collector, None));
+    }
+    if has_octave_0 && crowded {
+        run_foretold(octave_0, &mut collector, limit);
     }
     let doubled = options.first_octave < 0 && 2 * image.width.min(image.height) >= MIN_OCTAVE_SIDE;
     if doubled && collector.wants(Octave::max_scale_px(-1, options)) {
-        Octave::new(isa, Source::doubled(image, options), -1, options).run(&mut collector);
+        run_foretold(|| Octave::new(isa, Source::doubled(image, options), -1, options), &mut collector, limit);
     }
     collector.finish()
+}
+
+/// Runs an octave with a forecast from the coarser ones, and again without one where that kept too few.
+fn run_foretold<'a>(octave: impl Fn() -> Octave<'a>, collector: &mut Collector<'_>, limit: usize) {
+    let before = collector.clone();
+    let mut forecast = Forecast::new(collector.keypoints(), limit);
+    octave().run(collector, Some(&mut forecast));
+    if forecast.complete_from() > 0.0 && !collector.is_full_from(forecast.complete_from()) {
+        *collector = before;
+        octave().run(collector, None);
+    }
 }

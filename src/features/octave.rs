@@ -9,6 +9,7 @@ use super::blur::{BATCH, Kernel, Scratch, blur_rows};
 use super::collector::Collector;
 use super::descriptor::{self, Describer};
 use super::extrema::{self, Extremum, MAX_ROW_STEPS};
+use super::forecast::Forecast;
 use super::gradient::Patch;
 use super::options::SiftOptions;
 use super::orientation;
@@ -95,8 +96,9 @@ impl<'a> Octave<'a> {
         level_sigma(options, options.levels_per_octave as f32 + extrema::MAX_OFFSET) * 2.0_f32.powi(index)
     }
 
-    /// Finds and describes the features of the octave and returns the first level of the next.
-    pub(super) fn run(mut self, collector: &mut Collector<'_>) -> Plane {
+    /// Finds and describes the features of the octave, with a forecast only those that it wants, and returns the first level
+    /// of the next.
+    pub(super) fn run(mut self, collector: &mut Collector<'_>, mut forecast: Option<&mut Forecast>) -> Plane {
         let (width, height) = (self.levels.width, self.levels.height);
         let per_octave = self.options.levels_per_octave;
         let mut next = Plane { width: width.div_ceil(2), height: height.div_ceil(2), data: Vec::new() };
@@ -126,7 +128,15 @@ impl<'a> Octave<'a> {
                 candidates.clear();
                 extrema::scan_row(self.isa, &differences[s - 1..=s + 1], y - 1, width, self.options, &mut candidates);
                 let refined = candidates.iter().map(|&x| extrema::refine(&self.levels, x, y - 1, s, self.options));
-                extrema.extend(refined.flatten().filter(|extremum| collector.wants(self.scale_px(extremum))));
+                extrema.extend(refined.flatten().filter(|extremum| {
+                    let (scale, (x, y)) = (self.scale_px(extremum), self.place_px(extremum));
+                    collector.wants_at(x, y)
+                        && forecast.as_mut().is_none_or(|forecast| forecast.wants(scale))
+                        && collector.wants(scale)
+                }));
+            }
+            if let Some(forecast) = &mut forecast {
+                forecast.finish_row(y, self.step_px());
             }
             if let Some(first) = extrema.first() {
                 self.prefetch_patch(first);
@@ -137,6 +147,19 @@ impl<'a> Octave<'a> {
                 }
                 self.describe(extremum, &mut worker, collector);
             }
+        }
+        next
+    }
+
+    /// The first level of the next octave, without looking for features.
+    pub(super) fn next_seed(mut self) -> Plane {
+        let (width, height) = (self.levels.width, self.levels.height);
+        let mut next = Plane { width: width.div_ceil(2), height: height.div_ceil(2), data: Vec::new() };
+        next.data.reserve_exact(next.width * next.height);
+        let s = self.options.levels_per_octave;
+        for y in (0..height).step_by(2) {
+            self.ensure(s, y);
+            next.data.extend(self.levels.rings[s].row(y)[..width].iter().step_by(2));
         }
         next
     }
@@ -160,9 +183,22 @@ impl<'a> Octave<'a> {
         }
     }
 
+    /// Original pixels to a pixel of the octave.
+    fn step_px(&self) -> f32 {
+        2.0_f32.powi(self.index)
+    }
+
     /// The scale of an extremum in original pixels.
     fn scale_px(&self, extremum: &Extremum) -> f32 {
-        level_sigma(self.options, extremum.level) * 2.0_f32.powi(self.index)
+        level_sigma(self.options, extremum.level) * self.step_px()
+    }
+
+    /// The place of an extremum in original pixels (first pixel centre at 0.5, 0.5).
+    fn place_px(&self, extremum: &Extremum) -> (f32, f32) {
+        let step = self.step_px();
+        // Doubled pixels tile the original ones; from octave 0 on, every second pixel is kept, starting with the first.
+        let offset = if self.index < 0 { 0.5 * step } else { 0.5 };
+        (extremum.x * step + offset, extremum.y * step + offset)
     }
 
     /// Asks for the pixels that an extremum's description reads. The rings of a wide image lie in the third-level cache, and
@@ -180,17 +216,11 @@ impl<'a> Octave<'a> {
     /// Turns an extremum into features.
     fn describe(&self, extremum: &Extremum, worker: &mut Worker, collector: &mut Collector<'_>) {
         let sigma = level_sigma(self.options, extremum.level);
-        let step = 2.0_f32.powi(self.index);
         let scale = self.scale_px(extremum);
         if !collector.wants(scale) {
             return;
         }
-        // Doubled pixels tile the original ones; from octave 0 on, every second pixel is kept, starting with the first.
-        let offset = if self.index < 0 { 0.5 * step } else { 0.5 };
-        let (x, y) = (extremum.x * step + offset, extremum.y * step + offset);
-        if !collector.wants_at(x, y) {
-            return;
-        }
+        let (x, y) = self.place_px(extremum);
         let ring = &self.levels.rings[extremum.s];
         let size = (self.levels.width, self.levels.height);
         let (at, patch) = ((extremum.x, extremum.y), &mut worker.patch);
