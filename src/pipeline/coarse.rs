@@ -2,12 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::features::{FeatureCache, ImageFeatures};
-use super::intake::Intake;
+use super::intake::{Intake, Photograph};
 use super::options::{CoarseOptions, ReconstructionOptions};
 use super::run::key;
 use super::runner::{ArtifactKey, Counts, Runner, StageProgress, counts};
@@ -21,7 +22,7 @@ use crate::coarse::selection::SelectionOptions;
 use crate::coarse::{self, CoarseModels, MapperImage, MapperInput, MatchGraph};
 use crate::matching::two_view::{self, TwoViewGeometry};
 use crate::math::Rng;
-use crate::scene::{CameraId, ImageId, KeypointIdx};
+use crate::scene::{CameraId, Features, ImageId, KeypointIdx};
 
 /// Number of coarse matches of every pair that was matched, verified or not: what ranked matching goes by.
 pub type PairMatchCounts = MatchCounts;
@@ -49,6 +50,9 @@ struct CoarseMatches {
 const STREAM: u64 = 0x7477_6f5f_7669_6577;
 /// Memory for features read for their positions; they are read once here, so little is kept.
 const POSITION_CACHE_BYTES: usize = 64 << 20;
+/// Images a side of a tile of pairs: with the default selection of 16K features, 64 images are 60 MB. Sets up to this size are
+/// one tile.
+const TILE_IMAGES: u32 = 64;
 
 /// Matches and reconstructs the largest scales; widens the selection while too few images are registered and keeps the best.
 pub fn run(
@@ -175,12 +179,11 @@ struct Matcher<'a> {
     context: &'a Context,
 }
 
-/// The selected features of an image.
+/// The selected features of an image. Only those of a tile of pairs are in memory at a time.
 struct Selected {
     descriptors: CoarseDescriptors,
     pixels: Vec<Pixel>,
     camera: CameraId,
-    position: Option<GeoPosition>,
 }
 
 impl Matcher<'_> {
@@ -192,33 +195,15 @@ impl Matcher<'_> {
         settled: &BTreeSet<ImageId>,
         progress: &StageProgress<'_>,
     ) -> Result<(CoarseMatches, Counts), PipelineError> {
-        let images = self.select();
-        let pairing: Vec<PairingImage<'_>> = images
-            .iter()
-            .map(|(&id, selected)| PairingImage {
-                id,
-                descriptors: selected.descriptors.descriptors(),
-                position: selected.position,
-            })
-            .collect();
-        let pairs: Vec<(ImageId, ImageId)> = select_pairs(&pairing, &self.options.pairs)
-            .into_keys()
-            .filter(|(a, b)| !(settled.contains(a) && settled.contains(b)))
-            .collect();
-        let matched: Vec<Option<(u32, Option<TwoViewGeometry>)>> = pairs
-            .par_iter()
-            .enumerate()
-            .map(|(at, &(a, b))| {
-                if self.context.cancel.is_cancelled() {
-                    return None;
-                }
-                let (in_a, in_b) = (&images[&a], &images[&b]);
-                let matches = match_hybrid(&in_a.descriptors, &in_b.descriptors, &self.options.matching).matches;
-                let geometry = self.verify((a, b), (in_a, in_b), &matches, &self.intake.cameras);
-                progress.set(at as u64, pairs.len() as u64);
-                Some((matches.len() as u32, geometry))
-            })
-            .collect();
+        let pairs: Vec<(ImageId, ImageId)> =
+            self.pairs().into_iter().filter(|(a, b)| !(settled.contains(a) && settled.contains(b))).collect();
+        let done = AtomicU64::new(0);
+        let matched = self.for_pairs(&pairs, |(a, b), (in_a, in_b)| {
+            let matches = match_hybrid(&in_a.descriptors, &in_b.descriptors, &self.options.matching).matches;
+            let geometry = self.verify((a, b), (in_a, in_b), &matches, &self.intake.cameras);
+            progress.set(done.fetch_add(1, Ordering::Relaxed) + 1, pairs.len() as u64);
+            (matches.len() as u32, geometry)
+        });
         self.context.check_cancelled()?;
 
         let mut result = CoarseMatches {
@@ -227,8 +212,7 @@ impl Matcher<'_> {
             ..Default::default()
         };
         let (mut tentative, mut verified) = (0, 0);
-        for (&pair, outcome) in pairs.iter().zip(matched) {
-            let Some((count, geometry)) = outcome else { continue };
+        for (pair, (count, geometry)) in matched {
             tentative += usize::from(count > 0);
             result.match_counts.insert(pair, count);
             if let Some(geometry) = geometry {
@@ -238,14 +222,15 @@ impl Matcher<'_> {
         }
         result.cameras = if before.cameras.is_empty() {
             let mut cameras = self.intake.cameras.clone();
-            result.notes = focals::settle(&result.graph, &mut cameras, &images_cameras(&images), &self.options.focals);
+            result.notes = focals::settle(&result.graph, &mut cameras, &self.camera_of_image(), &self.options.focals);
             cameras
         } else {
             before.cameras.clone()
         };
-        self.reverify(&mut result, &images);
+        self.reverify(&mut result);
+        self.context.check_cancelled()?;
         let inliers = result.graph.pairs.values().map(|geometry| geometry.inliers.len()).sum();
-        let selected = images.values().map(|selected| selected.pixels.len()).sum();
+        let selected = self.usable().map(|(_, _, count)| self.selection.num_selected(count)).sum();
         let totals = counts([
             ("pairs_tried", pairs.len()),
             ("pairs_matched", tentative),
@@ -256,27 +241,84 @@ impl Matcher<'_> {
         Ok((result, totals))
     }
 
-    /// Reads the features of largest scale of every image.
-    fn select(&self) -> BTreeMap<ImageId, Selected> {
-        let photographs: Vec<_> = self.intake.photographs().collect();
-        let read = photographs.par_iter().filter_map(|(id, _, photograph)| {
-            let count = *self.found.get(id)?.count.as_ref().ok()?;
-            let features = self.cache.read(*id, Some(self.selection.num_selected(count)));
-            let pixels =
-                features.keypoints.iter().map(|keypoint| Pixel::new(f64::from(keypoint.x), f64::from(keypoint.y)));
-            let selected = Selected {
-                pixels: pixels.collect(),
-                descriptors: CoarseDescriptors::new(&features.descriptors),
-                camera: photograph.camera,
-                position: photograph
-                    .exif
-                    .gps
-                    .as_ref()
-                    .map(|gps| GeoPosition { latitude_deg: gps.latitude_deg, longitude_deg: gps.longitude_deg }),
-            };
-            Some((*id, selected))
-        });
-        read.collect::<Vec<_>>().into_iter().collect()
+    /// The images that have features, with their number.
+    fn usable(&self) -> impl Iterator<Item = (ImageId, &Photograph, usize)> {
+        self.intake
+            .photographs()
+            .filter_map(|(id, _, photograph)| Some((id, photograph, *self.found.get(&id)?.count.as_ref().ok()?)))
+    }
+
+    fn camera_of_image(&self) -> BTreeMap<ImageId, CameraId> {
+        self.usable().map(|(id, photograph, _)| (id, photograph.camera)).collect()
+    }
+
+    /// The pairs to match, by the few features of largest scale that pair selection looks at.
+    fn pairs(&self) -> Vec<(ImageId, ImageId)> {
+        let options = &self.options.pairs;
+        let usable: Vec<_> = self.usable().collect();
+        let all_pairs = usable.len() <= options.exhaustive_up_to;
+        let tops: Vec<Features> = usable
+            .par_iter()
+            .map(|&(id, _, count)| {
+                let wanted = if all_pairs { 0 } else { options.preemptive_features };
+                self.cache.read(id, Some(wanted.min(self.selection.num_selected(count))))
+            })
+            .collect();
+        let position = |photograph: &Photograph| {
+            let gps = photograph.exif.gps.as_ref()?;
+            Some(GeoPosition { latitude_deg: gps.latitude_deg, longitude_deg: gps.longitude_deg })
+        };
+        let pairing: Vec<PairingImage<'_>> = usable
+            .iter()
+            .zip(&tops)
+            .map(|(&(id, photograph, _), top)| PairingImage {
+                id,
+                descriptors: &top.descriptors,
+                position: position(photograph),
+            })
+            .collect();
+        select_pairs(&pairing, options).into_keys().collect()
+    }
+
+    /// Reads the features of largest scale of an image.
+    fn select(&self, id: ImageId, camera: CameraId) -> Selected {
+        let count = self.found.get(&id).and_then(|image| image.count.as_ref().ok()).copied().unwrap_or(0);
+        let features = self.cache.read(id, Some(self.selection.num_selected(count)));
+        let pixels = features.keypoints.iter().map(|at| Pixel::new(f64::from(at.x), f64::from(at.y))).collect();
+        Selected { pixels, descriptors: CoarseDescriptors::new(&features.descriptors), camera }
+    }
+
+    /// Does `work` for every pair, in parallel, with the selected features of both images. Pairs are done in tiles of images
+    /// that share what was read, so that memory does not grow with the number of images. Once cancelled, what is left is
+    /// left out.
+    fn for_pairs<T: Send>(
+        &self,
+        pairs: &[(ImageId, ImageId)],
+        work: impl Fn((ImageId, ImageId), (&Selected, &Selected)) -> T + Sync,
+    ) -> Vec<((ImageId, ImageId), T)> {
+        let cameras = self.camera_of_image();
+        let mut tiles: BTreeMap<(u32, u32), Vec<(ImageId, ImageId)>> = BTreeMap::new();
+        for &(a, b) in pairs {
+            tiles.entry((a.0 / TILE_IMAGES, b.0 / TILE_IMAGES)).or_default().push((a, b));
+        }
+        let mut images: BTreeMap<ImageId, Selected> = BTreeMap::new();
+        let mut results = Vec::with_capacity(pairs.len());
+        for tile in tiles.into_values() {
+            if self.context.cancel.is_cancelled() {
+                break;
+            }
+            let needed: BTreeSet<ImageId> = tile.iter().flat_map(|&(a, b)| [a, b]).collect();
+            images.retain(|id, _| needed.contains(id));
+            let missing: Vec<ImageId> = needed.into_iter().filter(|id| !images.contains_key(id)).collect();
+            let read = missing.into_par_iter().map(|id| (id, self.select(id, cameras[&id])));
+            images.extend(read.collect::<Vec<_>>());
+            let of_tile = tile.into_par_iter().filter_map(|(a, b)| {
+                let done = (!self.context.cancel.is_cancelled()).then(|| work((a, b), (&images[&a], &images[&b])));
+                Some(((a, b), done?))
+            });
+            results.extend(of_tile.collect::<Vec<_>>());
+        }
+        results
     }
 
     fn verify(
@@ -294,24 +336,23 @@ impl Matcher<'_> {
     /// Verifies those pairs again, as calibrated, whose focal lengths were not trusted the first time, so that they have
     /// relative poses. A focal length that is still a guess is taken for the moment: poses from it are rough but can start a
     /// model, which then refines it.
-    fn reverify(&self, result: &mut CoarseMatches, images: &BTreeMap<ImageId, Selected>) {
+    fn reverify(&self, result: &mut CoarseMatches) {
+        let camera_of = self.camera_of_image();
         let mut cameras = result.cameras.clone();
         for camera in cameras.values_mut() {
             camera.focal_source = camera.focal_source.max(FocalSource::Estimated);
         }
         let trusted = |id: &ImageId| {
-            let camera = &images[id].camera;
+            let camera = &camera_of[id];
             let before = &self.intake.cameras[camera];
             before.focal_source >= FocalSource::Exif && before == &result.cameras[camera]
         };
         let graph = &mut result.graph;
         let pending: Vec<(ImageId, ImageId)> =
             graph.pairs.keys().filter(|(a, b)| !(trusted(a) && trusted(b))).copied().collect();
-        let verified: Vec<Option<TwoViewGeometry>> = pending
-            .par_iter()
-            .map(|&(a, b)| self.verify((a, b), (&images[&a], &images[&b]), &graph.pairs[&(a, b)].inliers, &cameras))
-            .collect();
-        for (pair, geometry) in pending.into_iter().zip(verified) {
+        let verified =
+            self.for_pairs(&pending, |pair, images| self.verify(pair, images, &graph.pairs[&pair].inliers, &cameras));
+        for (pair, geometry) in verified {
             let Some(mut geometry) = geometry else { continue };
             let before = graph.pairs.remove(&pair).map(|before| before.inliers).unwrap_or_default();
             // A wrong focal length (one of both was zoomed) costs matches that the uncalibrated geometry explains.
@@ -321,8 +362,4 @@ impl Matcher<'_> {
             graph.pairs.insert(pair, geometry);
         }
     }
-}
-
-fn images_cameras(images: &BTreeMap<ImageId, Selected>) -> BTreeMap<ImageId, CameraId> {
-    images.iter().map(|(&id, selected)| (id, selected.camera)).collect()
 }
