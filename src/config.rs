@@ -49,6 +49,10 @@ pub struct ServerConfig {
     pub request_timeout: Duration,
     /// An upload that brings no byte for so long is given up.
     pub upload_idle_timeout: Duration,
+    /// A resumable upload is kept so long without a further byte.
+    pub upload_expiry: Duration,
+    /// How long a request waits for another that works on the same resumable upload.
+    pub upload_lock_wait: Duration,
     /// How often event streams say that they live.
     pub keep_alive: Duration,
     /// Time for requests and jobs to end when the service stops.
@@ -67,6 +71,8 @@ impl ServerConfig {
             uploads: UploadLimits::default(),
             request_timeout: Duration::from_secs(30),
             upload_idle_timeout: Duration::from_secs(60),
+            upload_expiry: Duration::from_secs(7 * 24 * 3600),
+            upload_lock_wait: Duration::from_secs(10),
             keep_alive: Duration::from_secs(15),
             shutdown_grace: Duration::from_secs(10),
         }

@@ -14,15 +14,15 @@ if ! command -v chromium >/dev/null && ! command -v chromium-browser >/dev/null 
   fi
 fi
 
-# pycolmap reads our COLMAP files independently of our code.
-if [ ! -e .venv/ready ]; then
+# pycolmap reads our COLMAP files, and the other packages talk to our service, independently of our code.
+if ! cmp -s tests/requirements.txt .venv/ready; then
   if command -v python3 >/dev/null; then
-    echo "setup: making .venv with pycolmap and numpy"
+    echo "setup: making .venv with the packages of tests/requirements.txt"
     rm -rf .venv
-    { python3 -m venv .venv && .venv/bin/pip install -q --disable-pip-version-check pycolmap numpy &&
-      .venv/bin/python -c 'import numpy, pycolmap' && touch .venv/ready; } ||
-      echo "setup: .venv could not be made (Debian: python3-venv); checks by independent readers will be skipped"
+    { python3 -m venv .venv && .venv/bin/pip install -q --disable-pip-version-check -r tests/requirements.txt &&
+      .venv/bin/python -c 'import numpy, pycolmap, tusclient' && cp tests/requirements.txt .venv/ready; } ||
+      echo "setup: .venv could not be made (Debian: python3-venv); checks by independent programs will be skipped"
   else
-    echo "setup: no python3; checks by independent readers will be skipped"
+    echo "setup: no python3; checks by independent programs will be skipped"
   fi
 fi

@@ -115,6 +115,18 @@ impl<S: Send + Sync> FromRequestParts<S> for DatasetId {
     }
 }
 
+/// The upload that an address names.
+pub(super) struct UploadId(pub(super) Uuid);
+
+impl<S: Send + Sync> FromRequestParts<S> for UploadId {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        let id = path_part(parts, state, "upload_id").await.and_then(|id| id.parse().ok());
+        id.map(Self).ok_or_else(|| Problem::new(Code::UploadNotFound))
+    }
+}
+
 /// The number of a photograph that an address names.
 pub(super) struct ImageNumber(pub(super) i64);
 

@@ -8,6 +8,7 @@ mod problem;
 mod routes;
 mod server;
 mod thumbnail;
+mod tus;
 mod upload;
 mod wire;
 
@@ -48,6 +49,8 @@ pub struct AppState {
     pub metrics: Arc<Metrics>,
     /// Cancelled when the service stops: open event streams end.
     pub shutdown: CancellationToken,
+    /// The resumable uploads that requests work on.
+    uploads: tus::UploadLocks,
     /// Bounds the memory that decoding takes.
     decoders: Arc<Semaphore>,
 }
@@ -60,6 +63,7 @@ impl AppState {
             config: Arc::new(config),
             metrics: Arc::default(),
             shutdown,
+            uploads: tus::UploadLocks::default(),
             decoders: Arc::new(Semaphore::new(DECODERS)),
         }
     }
@@ -79,6 +83,7 @@ pub fn router(state: AppState) -> Router {
     let slow = Router::new()
         .merge(routes::jobs::upload_router())
         .merge(routes::datasets::upload_router())
+        .merge(routes::uploads::router())
         .merge(routes::outputs::download_router())
         .merge(routes::job_events::router())
         // The upload counts for itself, and its limit is far above what any other body may have.

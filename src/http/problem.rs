@@ -7,11 +7,11 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
 use crate::jobs::JobsError;
-use crate::store::{ArchiveError, InvalidFileName, StoreError};
+use crate::store::{ArchiveError, InvalidFileName, StoreError, UploadError};
 
 /// Defines the codes with their status, in the order of `openapi.yaml`.
 macro_rules! codes {
-    ($($variant:ident $name:literal $status:ident),+ $(,)?) => {
+    ($($variant:ident $name:literal $status:literal),+ $(,)?) => {
         /// The stable name of a problem.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub enum Code {
@@ -29,43 +29,53 @@ macro_rules! codes {
 
             /// The status that goes with it.
             pub fn status(self) -> StatusCode {
-                match self { $(Self::$variant => StatusCode::$status),+ }
+                let status = match self { $(Self::$variant => $status),+ };
+                StatusCode::from_u16(status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR)
             }
         }
     };
 }
 
 codes! {
-    BadRequest "bad_request" BAD_REQUEST,
-    InvalidJson "invalid_json" BAD_REQUEST,
-    InvalidMultipart "invalid_multipart" BAD_REQUEST,
-    InvalidQuery "invalid_query" BAD_REQUEST,
-    NotFound "not_found" NOT_FOUND,
-    JobNotFound "job_not_found" NOT_FOUND,
-    DatasetNotFound "dataset_not_found" NOT_FOUND,
-    ImageNotFound "image_not_found" NOT_FOUND,
-    OutputNotFound "output_not_found" NOT_FOUND,
-    MethodNotAllowed "method_not_allowed" METHOD_NOT_ALLOWED,
-    RequestTimeout "request_timeout" REQUEST_TIMEOUT,
-    FileConflict "file_conflict" CONFLICT,
-    DatasetInUse "dataset_in_use" CONFLICT,
-    JobRunning "job_running" CONFLICT,
-    JobNotActive "job_not_active" CONFLICT,
-    JobNotResumable "job_not_resumable" CONFLICT,
-    PayloadTooLarge "payload_too_large" PAYLOAD_TOO_LARGE,
-    TooManyFiles "too_many_files" PAYLOAD_TOO_LARGE,
-    ArchiveTooLarge "archive_too_large" PAYLOAD_TOO_LARGE,
-    UnsupportedMediaType "unsupported_media_type" UNSUPPORTED_MEDIA_TYPE,
-    RangeNotSatisfiable "range_not_satisfiable" RANGE_NOT_SATISFIABLE,
-    InvalidFileName "invalid_file_name" UNPROCESSABLE_ENTITY,
-    InvalidArchive "invalid_archive" UNPROCESSABLE_ENTITY,
-    InvalidName "invalid_name" UNPROCESSABLE_ENTITY,
-    InvalidOptions "invalid_options" UNPROCESSABLE_ENTITY,
-    NoImages "no_images" UNPROCESSABLE_ENTITY,
-    ThumbnailUnavailable "thumbnail_unavailable" UNPROCESSABLE_ENTITY,
-    InternalError "internal_error" INTERNAL_SERVER_ERROR,
-    NotReady "not_ready" SERVICE_UNAVAILABLE,
-    DiskFull "disk_full" INSUFFICIENT_STORAGE,
+    BadRequest "bad_request" 400,
+    InvalidJson "invalid_json" 400,
+    InvalidMultipart "invalid_multipart" 400,
+    InvalidQuery "invalid_query" 400,
+    InvalidUpload "invalid_upload" 400,
+    UploadFinal "upload_final" 403,
+    NotFound "not_found" 404,
+    JobNotFound "job_not_found" 404,
+    DatasetNotFound "dataset_not_found" 404,
+    ImageNotFound "image_not_found" 404,
+    OutputNotFound "output_not_found" 404,
+    UploadNotFound "upload_not_found" 404,
+    MethodNotAllowed "method_not_allowed" 405,
+    RequestTimeout "request_timeout" 408,
+    FileConflict "file_conflict" 409,
+    DatasetInUse "dataset_in_use" 409,
+    JobRunning "job_running" 409,
+    JobNotActive "job_not_active" 409,
+    JobNotResumable "job_not_resumable" 409,
+    OffsetMismatch "offset_mismatch" 409,
+    UploadExpired "upload_expired" 410,
+    UnsupportedTusVersion "unsupported_tus_version" 412,
+    PayloadTooLarge "payload_too_large" 413,
+    TooManyFiles "too_many_files" 413,
+    ArchiveTooLarge "archive_too_large" 413,
+    UnsupportedMediaType "unsupported_media_type" 415,
+    RangeNotSatisfiable "range_not_satisfiable" 416,
+    InvalidFileName "invalid_file_name" 422,
+    InvalidArchive "invalid_archive" 422,
+    InvalidName "invalid_name" 422,
+    InvalidOptions "invalid_options" 422,
+    NoImages "no_images" 422,
+    ThumbnailUnavailable "thumbnail_unavailable" 422,
+    UploadConflict "upload_conflict" 422,
+    UploadLocked "upload_locked" 423,
+    ChecksumMismatch "checksum_mismatch" 460,
+    InternalError "internal_error" 500,
+    NotReady "not_ready" 503,
+    DiskFull "disk_full" 507,
 }
 
 /// What went wrong.
@@ -148,7 +158,8 @@ impl Problem {
         let status = self.code.status();
         let envelope = Envelope {
             r#type: "about:blank",
-            title: status.canonical_reason().unwrap_or("Error"),
+            // 460 is known to tus alone.
+            title: status.canonical_reason().unwrap_or("Checksum Mismatch"),
             status: status.as_u16(),
             code: self.code.as_str(),
             detail: self.detail.as_deref(),
@@ -215,6 +226,23 @@ impl From<JobsError> for Problem {
             JobsError::Running => Code::JobRunning,
             JobsError::NotActive(_) => Code::JobNotActive,
             JobsError::NotResumable(_) => Code::JobNotResumable,
+        };
+        Self::new(code).detail(error)
+    }
+}
+
+impl From<UploadError> for Problem {
+    fn from(error: UploadError) -> Self {
+        let code = match error {
+            UploadError::Store(error) => return error.into(),
+            UploadError::NotFound => Code::UploadNotFound,
+            UploadError::Expired => Code::UploadExpired,
+            UploadError::NotAPart(_) => Code::InvalidUpload,
+            UploadError::TooLong(_) => Code::PayloadTooLarge,
+            UploadError::Conflict(path) => {
+                let detail = "the path is stored already with other bytes";
+                return Self::new(Code::UploadConflict).detail(detail).path(path);
+            }
         };
         Self::new(code).detail(error)
     }

@@ -14,6 +14,9 @@ use crate::config::ServerConfig;
 use crate::jobs::{Engine, Executor, Hub, Jobs, recover};
 use crate::store::{Store, StoreError};
 
+/// Between two looks for uploads whose time is over.
+const SWEEP_INTERVAL: Duration = Duration::from_secs(60);
+
 /// Why the service could not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
@@ -63,6 +66,7 @@ impl Server {
         let shutdown = CancellationToken::new();
         let executor = Executor { jobs: jobs.clone(), threads: config.threads, seed: config.seed };
         let executor = tokio::spawn(executor.run(config.parallel_jobs, shutdown.clone()));
+        tokio::spawn(sweep(Arc::clone(&store), shutdown.clone()));
         let grace = config.shutdown_grace;
         let app = router(AppState::new(jobs, config, shutdown.clone()));
         let stop = shutdown.clone().cancelled_owned();
@@ -89,5 +93,20 @@ impl Server {
             self.executor.abort();
         }
         self.store.db.close().await;
+    }
+}
+
+/// Removes uploads whose time is over, from the start on and now and then.
+async fn sweep(store: Arc<Store>, shutdown: CancellationToken) {
+    loop {
+        match store.sweep_uploads().await {
+            Ok(0) => {}
+            Ok(expired) => tracing::info!(expired, "uploads expired"),
+            Err(error) => tracing::warn!(%error, "expired uploads could not be removed"),
+        }
+        tokio::select! {
+            () = tokio::time::sleep(SWEEP_INTERVAL) => {}
+            () = shutdown.cancelled() => return,
+        }
     }
 }

@@ -9,6 +9,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
+use sqlx::SqliteConnection;
 use tempfile::{NamedTempFile, TempPath};
 use uuid::Uuid;
 
@@ -66,12 +67,33 @@ impl StagedWriter {
     /// What the system said.
     pub fn finish(self, path: ImagePath) -> io::Result<StagedFile> {
         self.file.as_file().sync_all()?;
-        let sha256 = self.hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+        let sha256 = hex(&self.hash.finalize());
         Ok(StagedFile { path, size_bytes: self.size_bytes, sha256, file: self.file.into_temp_path() })
     }
 }
 
+/// Bytes in hexadecimal.
+pub(super) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 impl StagedFile {
+    /// Stages a durable file of this file system under a second name; its first name stays.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub(super) fn link(
+        file: &Path,
+        scratch: &Path,
+        path: ImagePath,
+        size_bytes: u64,
+        sha256: String,
+    ) -> io::Result<Self> {
+        let link = scratch.join(format!(".part-{}", Uuid::now_v7()));
+        std::fs::hard_link(file, &link)?;
+        Ok(Self { path, size_bytes, sha256, file: TempPath::try_from_path(link)? })
+    }
+
     /// Where its bytes lie now.
     pub fn staged_at(&self) -> &Path {
         &self.file
@@ -95,12 +117,23 @@ impl Store {
     /// [`StoreError::NotFound`] without such a dataset, or what the system or SQLite said.
     pub async fn commit_images(&self, dataset: Uuid, files: Vec<StagedFile>) -> Result<Committed, StoreError> {
         let mut tx = self.db.write().await?;
-        if datasets::find(&mut *tx, dataset).await?.is_none() {
-            return Err(StoreError::NotFound);
+        let (committed, conflict) = self.place_images(&mut tx, dataset, files).await?;
+        tx.commit().await?;
+        match conflict {
+            Some(path) => Err(StoreError::FileConflict(path.to_string())),
+            None => Ok(committed),
         }
-        if jobs::use_of_dataset(&mut tx, dataset).await?.1 {
-            return Err(StoreError::DatasetInUse);
-        }
+    }
+
+    /// Renames staged files into a dataset and writes their rows, as a part of a transaction. Stops at a path that is stored with
+    /// other bytes, and gives it.
+    pub(super) async fn place_images(
+        &self,
+        tx: &mut SqliteConnection,
+        dataset: Uuid,
+        files: Vec<StagedFile>,
+    ) -> Result<(Committed, Option<ImagePath>), StoreError> {
+        self.check_writable(tx, dataset).await?;
         let mut committed = Committed::default();
         let mut conflict = None;
         let mut new = Vec::new();
@@ -117,7 +150,7 @@ impl Store {
                         size_bytes: i64::try_from(file.size_bytes).unwrap_or(i64::MAX),
                         sha256: file.sha256.clone(),
                     };
-                    dataset_images::insert(&mut tx, dataset, &row).await?;
+                    dataset_images::insert(tx, dataset, &row).await?;
                     committed.stored += 1;
                     new.push(file);
                 }
@@ -126,11 +159,18 @@ impl Store {
         let folder = self.data.images(dataset);
         let root = self.data.root().to_path_buf();
         tokio::task::spawn_blocking(move || move_into(&root, &folder, new)).await.map_err(io::Error::other)??;
-        tx.commit().await?;
-        match conflict {
-            Some(path) => Err(StoreError::FileConflict(path.to_string())),
-            None => Ok(committed),
+        Ok((committed, conflict))
+    }
+
+    /// Fails unless photographs may be added to a dataset now.
+    pub(super) async fn check_writable(&self, tx: &mut SqliteConnection, dataset: Uuid) -> Result<(), StoreError> {
+        if datasets::find(&mut *tx, dataset).await?.is_none() {
+            return Err(StoreError::NotFound);
         }
+        if jobs::use_of_dataset(tx, dataset).await?.1 {
+            return Err(StoreError::DatasetInUse);
+        }
+        Ok(())
     }
 }
 

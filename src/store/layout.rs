@@ -8,7 +8,8 @@
 //! jobs/<id>/partial/...      outputs while a run writes them
 //! jobs/<id>/out/...          published outputs
 //! jobs/<id>/thumbnails/...   made on demand
-//! incoming/...               uploads on their way; emptied at start
+//! uploads/<id>               bytes of a resumable upload
+//! incoming/...               other uploads on their way; emptied at start
 //! trash/...                  folders being deleted; emptied at start
 //! ```
 
@@ -45,7 +46,7 @@ impl DataDir {
             }
             Err(TryLockError::Error(error)) => return Err(error),
         }
-        for folder in ["datasets", "jobs"] {
+        for folder in ["datasets", "jobs", "uploads"] {
             std::fs::create_dir_all(root.join(folder))?;
         }
         for folder in ["incoming", "trash"] {
@@ -95,6 +96,15 @@ impl DataDir {
     /// The thumbnails of a job's photographs.
     pub fn thumbnails(&self, job: Uuid) -> PathBuf {
         self.job(job).join("thumbnails")
+    }
+
+    pub(crate) fn uploads(&self) -> PathBuf {
+        self.root.join("uploads")
+    }
+
+    /// The bytes of a resumable upload.
+    pub(crate) fn upload(&self, upload: Uuid) -> PathBuf {
+        self.uploads().join(upload.to_string())
     }
 
     pub(crate) fn incoming(&self) -> PathBuf {

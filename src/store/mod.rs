@@ -7,6 +7,7 @@ pub mod db;
 mod file_name;
 mod incoming;
 mod layout;
+mod resumable;
 
 use std::io;
 use std::path::Path;
@@ -17,6 +18,10 @@ pub use db::Db;
 pub use file_name::{ImagePath, InvalidFileName};
 pub use incoming::{Committed, StagedFile, StagedWriter};
 pub use layout::DataDir;
+pub use resumable::{Appender, NewUpload, UploadError, UploadKind};
+
+/// Space that no work may fill, so that deleting and the database always work.
+const RESERVE_BYTES: u64 = 32 << 20;
 
 /// The database and the files that belong to it.
 #[derive(Debug)]
@@ -68,5 +73,28 @@ impl Store {
         let data = DataDir::open(root)?;
         let db = Db::open(&data.database()).await?;
         Ok(Self { db, data })
+    }
+
+    /// Bytes that work may still fill: a reserve for deleting and for the database is kept back, and what open uploads have
+    /// announced counts as taken.
+    ///
+    /// # Errors
+    /// What the system or SQLite said.
+    pub async fn free_bytes(&self) -> Result<u64, StoreError> {
+        let space = rustix::fs::statvfs(self.data.root()).map_err(io::Error::from)?;
+        let free = space.f_bavail.saturating_mul(space.f_frsize);
+        let promised = db::uploads::outstanding_bytes(self.db.reader()).await?;
+        Ok(free.saturating_sub(RESERVE_BYTES).saturating_sub(u64::try_from(promised).unwrap_or(0)))
+    }
+
+    /// Fails unless there is room for so many bytes more.
+    ///
+    /// # Errors
+    /// [`io::ErrorKind::StorageFull`], or what the system or SQLite said.
+    pub async fn check_space(&self, bytes: u64) -> Result<(), StoreError> {
+        if self.free_bytes().await? < bytes {
+            return Err(io::Error::from(io::ErrorKind::StorageFull).into());
+        }
+        Ok(())
     }
 }

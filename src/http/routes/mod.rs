@@ -6,3 +6,4 @@ pub(super) mod job_images;
 pub(super) mod jobs;
 pub(super) mod outputs;
 pub(super) mod service;
+pub(super) mod uploads;

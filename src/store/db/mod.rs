@@ -11,8 +11,10 @@ pub mod job_images;
 pub mod job_outputs;
 pub mod job_stages;
 pub mod jobs;
+pub mod uploads;
 
 use std::path::Path;
+use std::sync::OnceLock;
 use std::time::Duration;
 
 use sqlx::migrate::Migrator;
@@ -80,7 +82,15 @@ impl Db {
     }
 }
 
-/// The time, in milliseconds since 1970.
+/// The time, in milliseconds since 1970. Within one process it runs evenly, also through sleep: when somebody sets the system's
+/// clock meanwhile, nothing expires early and no duration turns negative.
 pub fn now_ms() -> i64 {
-    jiff::Timestamp::now().as_millisecond()
+    static START: OnceLock<(i64, i64)> = OnceLock::new();
+    let (wall_ms, boot_ms) = *START.get_or_init(|| (jiff::Timestamp::now().as_millisecond(), since_boot_ms()));
+    wall_ms + since_boot_ms() - boot_ms
+}
+
+fn since_boot_ms() -> i64 {
+    let time = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
+    time.tv_sec * 1000 + time.tv_nsec / 1_000_000
 }

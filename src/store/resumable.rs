@@ -1,0 +1,387 @@
+//! Uploads that go on where they broke off, whatever protocol brings the bytes.
+//!
+//! The bytes lie in one file an upload; its row counts those that are durable. Bytes behind that count were never acknowledged
+//! and are written over. A complete upload enters its dataset like any other photograph, in the transaction that marks it
+//! stored; until then its own file stays, so a failure in between costs nothing but another try.
+
+use std::fs::File;
+use std::io::{self, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest, Sha256};
+use sqlx::SqliteConnection;
+use uuid::Uuid;
+
+use super::db::uploads::UploadRow;
+use super::db::{dataset_images, now_ms, uploads};
+use super::incoming::{StagedFile, hex};
+use super::{ImagePath, Store, StoreError, atomic};
+
+/// Bytes copied at a time.
+const CHUNK_BYTES: usize = 1 << 20;
+
+/// What an upload is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum UploadKind {
+    /// A photograph.
+    Whole,
+    /// A part of one that is put together later.
+    Partial,
+    /// A photograph put together from parts.
+    Final,
+}
+
+impl UploadKind {
+    /// The name in the database.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Whole => "whole",
+            Self::Partial => "partial",
+            Self::Final => "final",
+        }
+    }
+}
+
+/// What a new upload is made of.
+#[derive(Clone, Debug)]
+pub struct NewUpload {
+    /// What it is for.
+    pub kind: UploadKind,
+    /// Its bytes in the end, where known.
+    pub length: Option<u64>,
+    /// Headers of the sender, kept to be told again.
+    pub metadata: String,
+    /// Likewise.
+    pub concat: Option<String>,
+    /// The dataset and the path there; none for a partial one.
+    pub target: Option<(Uuid, ImagePath)>,
+    /// Until when it is kept without a further byte.
+    pub expires_ms: i64,
+}
+
+/// Why an upload was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum UploadError {
+    /// There is no such upload.
+    #[error("there is no such upload")]
+    NotFound,
+    /// Its time is over.
+    #[error("the upload has expired")]
+    Expired,
+    /// The path is stored with other bytes.
+    #[error("{0:?} is stored already with other bytes")]
+    Conflict(String),
+    /// Something to be put together is no complete partial upload.
+    #[error("{0} is no complete partial upload")]
+    NotAPart(Uuid),
+    /// The parts add up to more than is taken.
+    #[error("the parts add up to more than {0} bytes")]
+    TooLong(u64),
+    /// What the store said.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+impl From<sqlx::Error> for UploadError {
+    fn from(error: sqlx::Error) -> Self {
+        Self::Store(error.into())
+    }
+}
+
+impl From<io::Error> for UploadError {
+    fn from(error: io::Error) -> Self {
+        Self::Store(error.into())
+    }
+}
+
+/// Appends to the file of an upload. Blocking.
+pub struct Appender {
+    path: PathBuf,
+    file: File,
+    size_bytes: u64,
+    failure: Option<io::Error>,
+}
+
+impl Appender {
+    /// Takes bytes; after a failure it takes no more, and [`Self::finish`] tells.
+    pub fn write(&mut self, bytes: &[u8]) -> bool {
+        let mut rest = bytes;
+        while self.failure.is_none() && !rest.is_empty() {
+            match self.file.write(rest) {
+                Ok(0) => self.failure = Some(io::ErrorKind::WriteZero.into()),
+                Ok(written) => {
+                    self.size_bytes += written as u64;
+                    rest = &rest[written..];
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => self.failure = Some(error),
+            }
+        }
+        self.failure.is_none()
+    }
+
+    /// Makes what was written durable; gives the file's length then, and the failure that ended the writing.
+    ///
+    /// # Errors
+    /// When nothing can be said about what is durable.
+    pub fn finish(self) -> io::Result<(u64, Option<io::Error>)> {
+        self.file.sync_data()?;
+        atomic::sync_parent(&self.path)?;
+        Ok((self.size_bytes, self.failure))
+    }
+}
+
+impl Store {
+    /// Opens the file of an upload behind its first `offset` bytes; what lies there goes. Blocking.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub fn append_upload(&self, id: Uuid, offset: u64) -> io::Result<Appender> {
+        let path = self.data.upload(id);
+        let mut file = File::options().create(true).truncate(false).write(true).open(&path)?;
+        file.set_len(offset)?;
+        file.seek(SeekFrom::Start(offset))?;
+        Ok(Appender { path, file, size_bytes: offset, failure: None })
+    }
+
+    /// Adds an upload without bytes.
+    ///
+    /// # Errors
+    /// A dataset that takes nothing now, a path stored with another length, or what the store said.
+    pub async fn create_upload(&self, new: NewUpload) -> Result<UploadRow, UploadError> {
+        let mut tx = self.db.write().await?;
+        let row = self.insert_upload(&mut tx, new).await?;
+        tx.commit().await?;
+        Ok(row)
+    }
+
+    async fn insert_upload(&self, tx: &mut SqliteConnection, new: NewUpload) -> Result<UploadRow, UploadError> {
+        if let Some((dataset, path)) = &new.target {
+            self.check_writable(tx, *dataset).await?;
+            let there = dataset_images::find(&mut *tx, *dataset, path.as_str()).await?;
+            if there.is_some_and(|there| new.length.is_some_and(|length| i64::try_from(length) != Ok(there.size_bytes)))
+            {
+                return Err(UploadError::Conflict(path.to_string()));
+            }
+        }
+        let row = UploadRow {
+            id: Uuid::now_v7().to_string(),
+            created_ms: now_ms(),
+            expires_ms: new.expires_ms,
+            kind: new.kind.as_str().to_owned(),
+            length: new.length.map(to_i64),
+            offset: 0,
+            metadata: new.metadata,
+            concat: new.concat,
+            dataset_id: new.target.as_ref().map(|(dataset, _)| dataset.to_string()),
+            path: new.target.map(|(_, path)| path.to_string()),
+            stored: false,
+        };
+        uploads::insert(tx, &row).await?;
+        Ok(row)
+    }
+
+    /// Adds an upload whose bytes are those of `parts`, in order; the parts stay.
+    ///
+    /// # Errors
+    /// Parts that can't be used, or as [`Self::create_upload`].
+    pub async fn concatenate_uploads(
+        &self,
+        mut new: NewUpload,
+        parts: Vec<Uuid>,
+        max_bytes: u64,
+    ) -> Result<UploadRow, UploadError> {
+        let mut tx = self.db.write().await?;
+        let mut length = 0u64;
+        for id in &parts {
+            let part = uploads::find(&mut *tx, *id).await?.ok_or(UploadError::NotAPart(*id))?;
+            if part.kind != UploadKind::Partial.as_str() || part.length != Some(part.offset) {
+                return Err(UploadError::NotAPart(*id));
+            }
+            length = length.saturating_add(to_u64(part.offset));
+        }
+        if length > max_bytes {
+            return Err(UploadError::TooLong(max_bytes));
+        }
+        new.length = Some(length);
+        let mut row = self.insert_upload(&mut tx, new).await?;
+        tx.commit().await?;
+        let id = upload_id(&row)?;
+        let (target, sources) = (self.data.upload(id), parts.iter().map(|part| self.data.upload(*part)));
+        let sources: Vec<PathBuf> = sources.collect();
+        let copied =
+            tokio::task::spawn_blocking(move || copy_parts(&target, &sources)).await.map_err(io::Error::other)?;
+        match copied {
+            Ok(copied) if copied == length => {
+                row.offset = to_i64(length);
+                self.save_upload(&row).await?;
+                Ok(row)
+            }
+            other => {
+                self.remove_upload(id).await?;
+                Err(other.err().unwrap_or_else(|| io::ErrorKind::UnexpectedEof.into()).into())
+            }
+        }
+    }
+
+    /// An upload whose time is not over.
+    ///
+    /// # Errors
+    /// [`UploadError::NotFound`], [`UploadError::Expired`], or what the store said.
+    pub async fn find_upload(&self, id: Uuid) -> Result<UploadRow, UploadError> {
+        let row = uploads::find(self.db.reader(), id).await?.ok_or(UploadError::NotFound)?;
+        if row.expires_ms <= now_ms() { Err(UploadError::Expired) } else { Ok(row) }
+    }
+
+    /// Writes the row of an upload, whose bytes are durable.
+    ///
+    /// # Errors
+    /// What SQLite said.
+    pub async fn save_upload(&self, row: &UploadRow) -> Result<(), StoreError> {
+        let mut tx = self.db.write().await?;
+        uploads::update(&mut tx, row).await?;
+        tx.commit().await?;
+        Ok(())
+    }
+
+    /// Puts a complete upload into its dataset. Asking again is no error; for a partial or incomplete one nothing happens.
+    ///
+    /// # Errors
+    /// [`UploadError::Conflict`], after which the upload is gone; a dataset that takes nothing now; what the store said.
+    pub async fn store_upload(&self, row: &mut UploadRow) -> Result<(), UploadError> {
+        let (Some(dataset), Some(path)) = (&row.dataset_id, &row.path) else { return Ok(()) };
+        if row.stored || row.length != Some(row.offset) {
+            return Ok(());
+        }
+        let dataset: Uuid = dataset.parse().map_err(|_| UploadError::NotFound)?;
+        let path = ImagePath::parse(path).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))?;
+        let id = upload_id(row)?;
+        let (file, scratch, size_bytes) = (self.data.upload(id), self.data.incoming(), to_u64(row.offset));
+        let staged = tokio::task::spawn_blocking(move || stage(&file, &scratch, path, size_bytes));
+        let staged = staged.await.map_err(io::Error::other)??;
+        let mut tx = self.db.write().await?;
+        let (_, conflict) = match self.place_images(&mut tx, dataset, vec![staged]).await {
+            Err(StoreError::FileConflict(path)) => return self.refuse(tx, id, path).await,
+            other => other?,
+        };
+        if let Some(path) = conflict {
+            return self.refuse(tx, id, path.to_string()).await;
+        }
+        row.stored = true;
+        uploads::update(&mut tx, row).await?;
+        tx.commit().await?;
+        self.forget_file(id).await;
+        Ok(())
+    }
+
+    /// A sender who asks for the state of a refused upload must not learn that all its bytes came, so it goes.
+    async fn refuse(
+        &self,
+        tx: sqlx::Transaction<'static, sqlx::Sqlite>,
+        id: Uuid,
+        path: String,
+    ) -> Result<(), UploadError> {
+        tx.rollback().await?;
+        self.remove_upload(id).await?;
+        Err(UploadError::Conflict(path))
+    }
+
+    /// Removes an upload; whether it was there.
+    ///
+    /// # Errors
+    /// What the store said.
+    pub async fn remove_upload(&self, id: Uuid) -> Result<bool, StoreError> {
+        let mut tx = self.db.write().await?;
+        let removed = uploads::delete(&mut tx, id).await?;
+        tx.commit().await?;
+        self.forget_file(id).await;
+        Ok(removed)
+    }
+
+    /// Removes uploads whose time is over, and files that belong to none; gives the number of the former.
+    ///
+    /// # Errors
+    /// What the store said.
+    pub async fn sweep_uploads(&self) -> Result<usize, StoreError> {
+        // Listed first: a file that comes later belongs to a row that is there by then.
+        let files: Vec<Uuid> =
+            atomic::list_files(&self.data.uploads())?.iter().filter_map(|name| name.parse().ok()).collect();
+        let expired: Vec<Uuid> =
+            uploads::expired(self.db.reader(), now_ms()).await?.iter().filter_map(|id| id.parse().ok()).collect();
+        for id in &expired {
+            self.remove_upload(*id).await?;
+        }
+        let known: std::collections::BTreeSet<Uuid> =
+            uploads::ids(self.db.reader()).await?.iter().filter_map(|id| id.parse().ok()).collect();
+        for id in files.into_iter().filter(|id| !known.contains(id)) {
+            self.forget_file(id).await;
+        }
+        Ok(expired.len())
+    }
+
+    /// Failing costs space, no more; the next sweep tries again.
+    async fn forget_file(&self, id: Uuid) {
+        match tokio::fs::remove_file(self.data.upload(id)).await {
+            Ok(()) => {}
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => tracing::warn!(upload = %id, %error, "the file of an upload could not be removed"),
+        }
+    }
+}
+
+/// The id of a row, which was written from one.
+pub(crate) fn upload_id(row: &UploadRow) -> Result<Uuid, StoreError> {
+    row.id.parse().map_err(|_| sqlx::Error::Decode(format!("{:?} is no id", row.id).into()).into())
+}
+
+fn to_i64(bytes: u64) -> i64 {
+    i64::try_from(bytes).unwrap_or(i64::MAX)
+}
+
+fn to_u64(bytes: i64) -> u64 {
+    u64::try_from(bytes).unwrap_or(0)
+}
+
+/// Hashes the file of a complete upload and gives it a second name for its way into the dataset.
+fn stage(file: &Path, scratch: &Path, path: ImagePath, size_bytes: u64) -> io::Result<StagedFile> {
+    let mut hash = Sha256::new();
+    // An upload of nothing never had a file.
+    let source = File::options().read(true).write(true).create(size_bytes == 0).truncate(false).open(file)?;
+    let mut reader = io::BufReader::with_capacity(CHUNK_BYTES, &source);
+    if io::copy(&mut reader, &mut HashWriter(&mut hash))? != size_bytes {
+        return Err(io::Error::new(io::ErrorKind::UnexpectedEof, "an upload's file lost bytes"));
+    }
+    source.sync_all()?;
+    StagedFile::link(file, scratch, path, size_bytes, hex(&hash.finalize()))
+}
+
+/// Feeds what is written into a hash.
+struct HashWriter<'a>(&'a mut Sha256);
+
+impl Write for HashWriter<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Writes the bytes of all parts into one durable file.
+fn copy_parts(target: &Path, parts: &[PathBuf]) -> io::Result<u64> {
+    let mut file = File::create(target)?;
+    let mut length = 0;
+    for part in parts {
+        match File::open(part) {
+            Ok(mut part) => length += io::copy(&mut part, &mut file)?,
+            // A part of no bytes never had a file.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => return Err(error),
+        }
+    }
+    file.sync_all()?;
+    atomic::sync_parent(target)?;
+    Ok(length)
+}
