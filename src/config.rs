@@ -30,6 +30,25 @@ impl Default for UploadLimits {
     }
 }
 
+/// Who may use the service.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AccessPolicy {
+    /// Whether every request needs a token.
+    pub token_required: bool,
+    /// Origins of other sites whose pages may use the service, such as `https://survey.example`.
+    pub cors_origins: Vec<String>,
+    /// Requests of one token, on average; bursts may bring ten seconds' worth.
+    pub requests_per_s: u32,
+    /// Wrong tokens that one address may try.
+    pub failures_per_min: u32,
+}
+
+impl Default for AccessPolicy {
+    fn default() -> Self {
+        Self { token_required: false, cors_origins: Vec::new(), requests_per_s: 500, failures_per_min: 10 }
+    }
+}
+
 /// Settings of `multistage serve`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ServerConfig {
@@ -43,6 +62,8 @@ pub struct ServerConfig {
     pub parallel_jobs: usize,
     /// Seed of every job's run.
     pub seed: u64,
+    /// Who may use it.
+    pub access: AccessPolicy,
     /// What uploads may bring.
     pub uploads: UploadLimits,
     /// Time for a request other than uploads, downloads and event streams.
@@ -68,6 +89,7 @@ impl ServerConfig {
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             parallel_jobs: 1,
             seed: 0,
+            access: AccessPolicy::default(),
             uploads: UploadLimits::default(),
             request_timeout: Duration::from_secs(30),
             upload_idle_timeout: Duration::from_secs(60),

@@ -4,6 +4,8 @@
 
 mod service;
 
+#[path = "service/access.rs"]
+mod access;
 #[path = "service/datasets.rs"]
 mod datasets;
 #[path = "service/events.rs"]

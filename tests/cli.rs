@@ -14,6 +14,8 @@ mod reconstruct;
 mod rendered;
 #[path = "cli/synthesize.rs"]
 mod synthesize;
+#[path = "cli/token.rs"]
+mod token;
 #[path = "cli/zoomed.rs"]
 mod zoomed;
 

@@ -11,6 +11,7 @@ mod progress;
 mod reconstruct;
 mod serve;
 mod synthesize;
+mod token;
 
 use std::process::ExitCode;
 
@@ -39,6 +40,8 @@ enum Command {
     Serve(serve::Args),
     /// Make photographs or features of a scene whose truth is known.
     Synthesize(synthesize::Args),
+    /// Make, list and revoke the tokens that open the service.
+    Token(token::Args),
 }
 
 /// How a command ended otherwise than well.
@@ -73,6 +76,7 @@ pub fn run() -> ExitCode {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Serve(args) => serve::run(&args),
         Command::Synthesize(args) => synthesize::run(&args),
+        Command::Token(args) => token::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

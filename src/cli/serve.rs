@@ -2,7 +2,7 @@
 
 use std::io::Write;
 use std::net::SocketAddr;
-use std::num::{NonZeroU64, NonZeroUsize};
+use std::num::{NonZeroU32, NonZeroU64, NonZeroUsize};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,9 +19,21 @@ use crate::jobs::PipelineEngine;
 /// Arguments of `multistage serve`.
 #[derive(Debug, clap::Args)]
 pub(super) struct Args {
-    /// Address to listen on; port 0 takes a free one. Keep it on this machine unless something in front checks who may come in.
+    /// Address to listen on; port 0 takes a free one. Beyond this machine, every request needs a token.
     #[arg(long, env = "MULTISTAGE_BIND", default_value = "127.0.0.1:8080")]
     bind: SocketAddr,
+    /// Serve without tokens beyond this machine too: whoever reaches the address may do everything.
+    #[arg(long, env = "MULTISTAGE_INSECURE", conflicts_with = "require_token")]
+    insecure: bool,
+    /// Require tokens on this machine as well, as behind a proxy.
+    #[arg(long, env = "MULTISTAGE_REQUIRE_TOKEN")]
+    require_token: bool,
+    /// Origin of another site whose pages may use the service; may be given again.
+    #[arg(long = "cors-origin", env = "MULTISTAGE_CORS_ORIGINS", value_delimiter = ',')]
+    cors_origins: Vec<String>,
+    /// Requests a second that one token may send, on average [default: 500].
+    #[arg(long, env = "MULTISTAGE_REQUESTS_PER_S")]
+    requests_per_s: Option<NonZeroU32>,
     /// Directory that keeps photographs, jobs and models; one process at a time may use it.
     #[arg(long, env = "MULTISTAGE_DATA_DIR", default_value = "./multistage-data")]
     data_dir: PathBuf,
@@ -60,6 +72,10 @@ impl Args {
         config.threads = self.threads.map_or(config.threads, NonZeroUsize::get);
         config.parallel_jobs = self.max_parallel_jobs.get();
         config.seed = self.seed;
+        let access = &mut config.access;
+        access.token_required = self.require_token || !(self.insecure || self.bind.ip().is_loopback());
+        access.cors_origins.clone_from(&self.cors_origins);
+        access.requests_per_s = self.requests_per_s.map_or(access.requests_per_s, NonZeroU32::get);
         let uploads = &mut config.uploads;
         uploads.max_upload_bytes = self.max_upload_bytes.map_or(uploads.max_upload_bytes, NonZeroU64::get);
         uploads.archive.max_total_bytes = uploads.max_upload_bytes;

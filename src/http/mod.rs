@@ -1,5 +1,6 @@
 //! The web service: a router over the job queue and the store. `openapi.yaml` is its contract.
 
+mod access;
 mod download;
 mod extract;
 mod metrics;
@@ -28,6 +29,7 @@ use tower_http::timeout::TimeoutLayer;
 use tracing::Instrument;
 use uuid::Uuid;
 
+use access::RateLimits;
 pub use metrics::Metrics;
 pub use problem::{Code, Problem};
 pub use server::{Server, ServerError};
@@ -49,6 +51,8 @@ pub struct AppState {
     pub metrics: Arc<Metrics>,
     /// Cancelled when the service stops: open event streams end.
     pub shutdown: CancellationToken,
+    /// Requests of tokens and guesses of addresses.
+    rates: Arc<RateLimits>,
     /// The resumable uploads that requests work on.
     uploads: tus::UploadLocks,
     /// Bounds the memory that decoding takes.
@@ -58,9 +62,11 @@ pub struct AppState {
 impl AppState {
     /// A state around a queue.
     pub fn new(jobs: Jobs, config: ServerConfig, shutdown: CancellationToken) -> Self {
+        let rates = RateLimits::new(config.access.requests_per_s, config.access.failures_per_min);
         Self {
             jobs,
             config: Arc::new(config),
+            rates: Arc::new(rates),
             metrics: Arc::default(),
             shutdown,
             uploads: tus::UploadLocks::default(),
@@ -69,7 +75,8 @@ impl AppState {
     }
 }
 
-/// The whole service. Layers from the outside in: request id, log and problems; panics; headers for browsers.
+/// The whole service. Layers from the outside in: request id, log and problems; panics; headers for browsers; other
+/// sites; then, by route, who asks.
 pub fn router(state: AppState) -> Router {
     let timeout = TimeoutLayer::with_status_code(StatusCode::REQUEST_TIMEOUT, state.config.request_timeout);
     let quick = Router::new()
@@ -79,6 +86,8 @@ pub fn router(state: AppState) -> Router {
         .merge(routes::outputs::router())
         .merge(routes::service::router())
         .layer(timeout);
+    // What tells nothing about anybody's things, and the page, which asks for the rest.
+    let open = routes::service::open_router().layer(timeout);
     // Uploads have an idle limit of their own; downloads and event streams last as long as they last.
     let slow = Router::new()
         .merge(routes::jobs::upload_router())
@@ -90,8 +99,11 @@ pub fn router(state: AppState) -> Router {
         .layer(DefaultBodyLimit::disable());
     quick
         .merge(slow)
+        .layer(middleware::from_fn_with_state(state.clone(), access::admit))
+        .merge(open)
         .fallback(|| async { Problem::new(Code::NotFound) })
         .method_not_allowed_fallback(|| async { Problem::new(Code::MethodNotAllowed) })
+        .layer(middleware::from_fn_with_state(state.clone(), access::guard_browsers))
         .layer(middleware::map_response(browser_headers))
         .layer(CatchPanicLayer::custom(panicked))
         .layer(middleware::from_fn_with_state(state.clone(), account))
@@ -121,14 +133,15 @@ async fn account(State(state): State<AppState>, request: Request, next: Next) ->
 
 /// What keeps a browser from guessing types, framing the page or telling other sites where it was.
 async fn browser_headers(mut response: Response) -> Response {
-    const HEADERS: [(HeaderName, &str); 4] = [
+    const HEADERS: [(HeaderName, &str); 5] = [
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
         (header::X_FRAME_OPTIONS, "DENY"),
         (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+        (header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"),
     ];
     for (name, value) in HEADERS {
-        response.headers_mut().insert(name, HeaderValue::from_static(value));
+        response.headers_mut().entry(name).or_insert(HeaderValue::from_static(value));
     }
     if !response.headers().contains_key(header::CACHE_CONTROL) {
         response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));

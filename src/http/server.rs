@@ -69,6 +69,7 @@ impl Server {
         tokio::spawn(sweep(Arc::clone(&store), shutdown.clone()));
         let grace = config.shutdown_grace;
         let app = router(AppState::new(jobs, config, shutdown.clone()));
+        let app = app.into_make_service_with_connect_info::<SocketAddr>();
         let stop = shutdown.clone().cancelled_owned();
         let listener = tokio::spawn(async move { axum::serve(listener, app).with_graceful_shutdown(stop).await });
         Ok(Self { address, shutdown, listener, executor, grace, store })

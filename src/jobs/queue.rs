@@ -40,6 +40,8 @@ pub struct NewJob {
     pub options: serde_json::Value,
     /// Files of its own upload that were no photographs.
     pub ignored: Option<usize>,
+    /// The token it belongs to.
+    pub owner_token: Option<Uuid>,
 }
 
 /// Why a move was refused.
@@ -159,6 +161,7 @@ impl Jobs {
             dataset: new.dataset,
             options: new.options.to_string(),
             ignored: new.ignored.map(|n| i64::try_from(n).unwrap_or(i64::MAX)),
+            owner_token: new.owner_token,
         };
         jobs::insert(&mut tx, &row).await?;
         job_images::freeze(&mut tx, new.id, new.dataset).await?;

@@ -62,7 +62,12 @@ impl DataDir {
     }
 
     pub(crate) fn database(&self) -> PathBuf {
-        self.root.join("multistage.db")
+        Self::database_in(&self.root)
+    }
+
+    /// The database of a data directory that may be another process's.
+    pub fn database_in(root: &Path) -> PathBuf {
+        root.join("multistage.db")
     }
 
     pub(crate) fn dataset(&self, dataset: Uuid) -> PathBuf {

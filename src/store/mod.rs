@@ -8,6 +8,7 @@ mod file_name;
 mod incoming;
 mod layout;
 mod resumable;
+mod token;
 
 use std::io;
 use std::path::Path;
@@ -19,6 +20,7 @@ pub use file_name::{ImagePath, InvalidFileName};
 pub use incoming::{Committed, StagedFile, StagedWriter};
 pub use layout::DataDir;
 pub use resumable::{Appender, NewUpload, UploadError, UploadKind};
+pub use token::{Scope, create_token, find_token};
 
 /// Space that no work may fill, so that deleting and the database always work.
 const RESERVE_BYTES: u64 = 32 << 20;

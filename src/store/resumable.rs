@@ -57,6 +57,8 @@ pub struct NewUpload {
     pub target: Option<(Uuid, ImagePath)>,
     /// Until when it is kept without a further byte.
     pub expires_ms: i64,
+    /// Whose it is.
+    pub owner_token: Option<Uuid>,
 }
 
 /// Why an upload was refused.
@@ -176,6 +178,7 @@ impl Store {
             dataset_id: new.target.as_ref().map(|(dataset, _)| dataset.to_string()),
             path: new.target.map(|(_, path)| path.to_string()),
             stored: false,
+            owner_token: new.owner_token.map(|token| token.to_string()),
         };
         uploads::insert(tx, &row).await?;
         Ok(row)
@@ -298,7 +301,7 @@ impl Store {
         Ok(removed)
     }
 
-    /// Removes uploads whose time is over, and files that belong to none; gives the number of the former.
+    /// Removes uploads whose time is over, and files that serve none; gives the number of the former.
     ///
     /// # Errors
     /// What the store said.
@@ -312,7 +315,7 @@ impl Store {
             self.remove_upload(*id).await?;
         }
         let known: std::collections::BTreeSet<Uuid> =
-            uploads::ids(self.db.reader()).await?.iter().filter_map(|id| id.parse().ok()).collect();
+            uploads::with_file(self.db.reader()).await?.iter().filter_map(|id| id.parse().ok()).collect();
         for id in files.into_iter().filter(|id| !known.contains(id)) {
             self.forget_file(id).await;
         }

@@ -8,6 +8,7 @@ use axum::routing::{get, post};
 use serde::Deserialize;
 use uuid::Uuid;
 
+use crate::http::access::Principal;
 use crate::http::extract::{DatasetId, Json, Page, Query, cut, media_type};
 use crate::http::problem::{Code, Problem};
 use crate::http::upload::receive;
@@ -33,9 +34,19 @@ async fn find(state: &AppState, id: Uuid) -> Result<DatasetRow, Problem> {
     datasets::find(state.jobs.store.db.reader(), id).await?.ok_or_else(|| Problem::new(Code::DatasetNotFound))
 }
 
-async fn list(State(state): State<AppState>, Query(page): Query<Page>) -> Result<Response, Problem> {
+async fn list(
+    State(state): State<AppState>,
+    principal: Principal,
+    Query(page): Query<Page>,
+) -> Result<Response, Problem> {
     let limit = page.limit()?;
-    let mut rows = datasets::list(state.jobs.store.db.reader(), page.number_or(i64::MAX)?, limit + 1).await?;
+    let mut rows = datasets::list(
+        state.jobs.store.db.reader(),
+        principal.sees_only().as_deref(),
+        page.number_or(i64::MAX)?,
+        limit + 1,
+    )
+    .await?;
     let more = cut(&mut rows, limit);
     let next_cursor = rows.last().filter(|_| more).map(|row| row.seq.to_string());
     let datasets = rows.into_iter().map(wire::Dataset::new).collect();
@@ -50,13 +61,17 @@ struct NewDatasetBody {
     name: String,
 }
 
-async fn create(State(state): State<AppState>, Json(body): Json<NewDatasetBody>) -> Result<Response, Problem> {
+async fn create(
+    State(state): State<AppState>,
+    principal: Principal,
+    Json(body): Json<NewDatasetBody>,
+) -> Result<Response, Problem> {
     if body.name.chars().count() > MAX_NAME_CHARS {
         return Err(Problem::new(Code::InvalidName).detail(format!("a name has at most {MAX_NAME_CHARS} letters")));
     }
     let id = Uuid::now_v7();
     let mut tx = state.jobs.store.db.write().await?;
-    datasets::insert(&mut tx, id, &body.name, now_ms(), None).await?;
+    datasets::insert(&mut tx, id, &body.name, now_ms(), None, principal.owner()).await?;
     tx.commit().await?;
     let dataset = wire::Dataset::new(find(&state, id).await?);
     let location = [(header::LOCATION, format!("/api/v1/datasets/{id}"))];

@@ -8,12 +8,14 @@ use axum::routing::{get, post};
 use serde::Deserialize;
 use uuid::Uuid;
 
+use crate::http::access::Principal;
 use crate::http::extract::{JobId, Json, Page, Query, cut, media_type};
 use crate::http::problem::{Code, Problem};
 use crate::http::upload::{Received, receive};
 use crate::http::{AppState, wire};
 use crate::jobs::{Jobs, NewJob};
 use crate::store::db::jobs::JobRow;
+use crate::store::db::tokens::Owned;
 use crate::store::db::{datasets, job_images, job_stages, jobs, now_ms};
 
 /// Quick requests.
@@ -39,9 +41,19 @@ pub(in crate::http) async fn view(state: &AppState, row: JobRow) -> Result<wire:
     Ok(wire::Job::new(row, &stages, images))
 }
 
-async fn list(State(state): State<AppState>, Query(page): Query<Page>) -> Result<Response, Problem> {
+async fn list(
+    State(state): State<AppState>,
+    principal: Principal,
+    Query(page): Query<Page>,
+) -> Result<Response, Problem> {
     let limit = page.limit()?;
-    let mut rows = jobs::list(state.jobs.store.db.reader(), page.number_or(i64::MAX)?, limit + 1).await?;
+    let mut rows = jobs::list(
+        state.jobs.store.db.reader(),
+        principal.sees_only().as_deref(),
+        page.number_or(i64::MAX)?,
+        limit + 1,
+    )
+    .await?;
     let more = cut(&mut rows, limit);
     let next_cursor = rows.last().filter(|_| more).map(|row| row.seq.to_string());
     let mut shown = Vec::with_capacity(rows.len());
@@ -81,18 +93,25 @@ struct NewJobBody {
     options: Option<serde_json::Map<String, serde_json::Value>>,
 }
 
-async fn create(State(state): State<AppState>, request: Request) -> Result<Response, Problem> {
+async fn create(State(state): State<AppState>, principal: Principal, request: Request) -> Result<Response, Problem> {
     let row = match media_type(request.headers()).as_str() {
         "multipart/form-data" => {
             let multipart = Multipart::from_request(request, &state)
                 .await
                 .map_err(|error| Problem::new(Code::InvalidMultipart).detail(error.body_text()))?;
-            create_with_upload(&state, multipart).await?
+            create_with_upload(&state, &principal, multipart).await?
         }
         "application/json" => {
             let Json(body): Json<NewJobBody> = Json::from_request(request, &state).await?;
-            let options = serde_json::Value::Object(body.options.unwrap_or_default());
-            let new = NewJob { id: Uuid::now_v7(), name: body.name, dataset: body.dataset_id, options, ignored: None };
+            principal.check_sees(&state, Owned::Dataset(body.dataset_id)).await?;
+            let new = NewJob {
+                id: Uuid::now_v7(),
+                name: body.name,
+                dataset: body.dataset_id,
+                options: serde_json::Value::Object(body.options.unwrap_or_default()),
+                ignored: None,
+                owner_token: principal.owner(),
+            };
             state.jobs.enqueue(new).await?
         }
         _ => {
@@ -128,16 +147,17 @@ impl Drop for OwnDataset {
     }
 }
 
-async fn create_with_upload(state: &AppState, multipart: Multipart) -> Result<JobRow, Problem> {
+async fn create_with_upload(state: &AppState, principal: &Principal, multipart: Multipart) -> Result<JobRow, Problem> {
     let (id, dataset) = (Uuid::now_v7(), Uuid::now_v7());
     let mut tx = state.jobs.store.db.write().await?;
-    datasets::insert(&mut tx, dataset, "", now_ms(), Some(id)).await?;
+    datasets::insert(&mut tx, dataset, "", now_ms(), Some(id), principal.owner()).await?;
     tx.commit().await?;
     let mut own = OwnDataset { jobs: state.jobs.clone(), dataset, kept: false };
     let received = receive(state, multipart, dataset, true).await?;
     let options = options_of(&received)?;
     let name = received.name.unwrap_or_default();
-    let row = state.jobs.enqueue(NewJob { id, name, dataset, options, ignored: Some(received.ignored) }).await?;
+    let (ignored, owner_token) = (Some(received.ignored), principal.owner());
+    let row = state.jobs.enqueue(NewJob { id, name, dataset, options, ignored, owner_token }).await?;
     own.kept = true;
     Ok(row)
 }

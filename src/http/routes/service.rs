@@ -15,10 +15,14 @@ use crate::store::db::jobs;
 const LEAST_FREE_BYTES: u64 = 64 << 20;
 
 pub(in crate::http) fn router() -> Router<AppState> {
+    Router::new().route("/metrics", get(metrics))
+}
+
+/// What everybody may see.
+pub(in crate::http) fn open_router() -> Router<AppState> {
     Router::new()
         .route("/healthz", get(health))
         .route("/readyz", get(ready))
-        .route("/metrics", get(metrics))
         .route("/openapi.yaml", get(openapi))
         .route("/", get(index))
         .route("/static/{*path}", get(file))

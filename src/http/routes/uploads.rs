@@ -14,10 +14,12 @@ use jiff::fmt::rfc2822::DateTimePrinter;
 use uuid::Uuid;
 
 use crate::http::AppState;
+use crate::http::access::Principal;
 use crate::http::extract::{UploadId, media_type};
 use crate::http::problem::{Code, Problem};
 use crate::http::tus::{self, Append, Checksum, Concat, Length, Target, UploadGuard};
 use crate::store::db::now_ms;
+use crate::store::db::tokens::Owned;
 use crate::store::db::uploads::UploadRow;
 use crate::store::{NewUpload, UploadKind};
 
@@ -67,7 +69,7 @@ async fn describe(State(state): State<AppState>) -> Response {
     (StatusCode::NO_CONTENT, headers).into_response()
 }
 
-async fn create(State(state): State<AppState>, request: Request) -> Result<Response, Problem> {
+async fn create(State(state): State<AppState>, principal: Principal, request: Request) -> Result<Response, Problem> {
     match tus::method(&request)? {
         Method::POST => {}
         Method::OPTIONS => return Ok(describe(State(state)).await),
@@ -82,6 +84,9 @@ async fn create(State(state): State<AppState>, request: Request) -> Result<Respo
         Some(Concat::Partial) => None,
         _ => Some(Target::of(&headers)?),
     };
+    if let Some(target) = &target {
+        principal.check_sees(&state, Owned::Dataset(target.dataset)).await?;
+    }
     let mut new = NewUpload {
         kind: UploadKind::Whole,
         length: None,
@@ -89,9 +94,13 @@ async fn create(State(state): State<AppState>, request: Request) -> Result<Respo
         concat: headers.get(tus::UPLOAD_CONCAT).and_then(|value| value.to_str().ok()).map(str::to_owned),
         target: target.map(|target| (target.dataset, target.path)),
         expires_ms: expires_ms(&state),
+        owner_token: principal.owner(),
     };
     if let Some(Concat::Final(parts)) = concat {
         new.kind = UploadKind::Final;
+        for part in &parts {
+            principal.check_sees(&state, Owned::Upload(*part)).await?;
+        }
         let store = Arc::clone(&state.jobs.store);
         let max_bytes = state.config.uploads.max_file_bytes;
         // In a task of its own, so that a sender who leaves can't leave it half done.

@@ -27,15 +27,17 @@ pub async fn insert(
     name: &str,
     created_ms: i64,
     owner_job: Option<Uuid>,
+    owner_token: Option<Uuid>,
 ) -> sqlx::Result<()> {
     sqlx::query(
-        "INSERT INTO datasets (id, seq, name, created_ms, owner_job)
-         VALUES (?, (SELECT COALESCE(MAX(seq), 0) + 1 FROM datasets), ?, ?, ?)",
+        "INSERT INTO datasets (id, seq, name, created_ms, owner_job, owner_token)
+         VALUES (?, (SELECT COALESCE(MAX(seq), 0) + 1 FROM datasets), ?, ?, ?, ?)",
     )
     .bind(id.to_string())
     .bind(name)
     .bind(created_ms)
     .bind(owner_job.map(|job| job.to_string()))
+    .bind(owner_token.map(|token| token.to_string()))
     .execute(db)
     .await?;
     Ok(())
@@ -53,15 +55,23 @@ pub async fn find(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<Option<
     .await
 }
 
-/// Datasets older than the one with `seq` `before`, newest first. One whose upload is not complete yet is left out.
-pub async fn list(db: impl SqliteExecutor<'_>, before: i64, limit: u32) -> sqlx::Result<Vec<DatasetRow>> {
+/// Datasets older than the one with `seq` `before`, newest first, of one token or of all. One whose upload is not complete yet is
+/// left out.
+pub async fn list(
+    db: impl SqliteExecutor<'_>,
+    owner_token: Option<&str>,
+    before: i64,
+    limit: u32,
+) -> sqlx::Result<Vec<DatasetRow>> {
     sqlx::query_as(
         "SELECT d.id, d.seq, d.name, d.created_ms, COUNT(i.path) AS images, COALESCE(SUM(i.size_bytes), 0) AS size_bytes
          FROM datasets d LEFT JOIN dataset_images i ON i.dataset_id = d.id
-         WHERE d.seq < ? AND (d.owner_job IS NULL OR d.owner_job IN (SELECT id FROM jobs))
+         WHERE d.seq < ? AND (? IS NULL OR d.owner_token = ?) AND (d.owner_job IS NULL OR d.owner_job IN (SELECT id FROM jobs))
          GROUP BY d.id ORDER BY d.seq DESC LIMIT ?",
     )
     .bind(before)
+    .bind(owner_token)
+    .bind(owner_token)
     .bind(limit)
     .fetch_all(db)
     .await

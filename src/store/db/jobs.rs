@@ -59,13 +59,15 @@ pub struct NewJobRow {
     pub options: String,
     /// Files of its upload that were no photographs.
     pub ignored: Option<i64>,
+    /// Whose it is.
+    pub owner_token: Option<Uuid>,
 }
 
 /// Adds a queued job.
 pub async fn insert(db: &mut SqliteConnection, job: &NewJobRow) -> sqlx::Result<()> {
     sqlx::query(
-        "INSERT INTO jobs (id, seq, name, state, created_ms, dataset_id, options, ignored)
-         VALUES (?, (SELECT COALESCE(MAX(seq), 0) + 1 FROM jobs), ?, 'queued', ?, ?, ?, ?)",
+        "INSERT INTO jobs (id, seq, name, state, created_ms, dataset_id, options, ignored, owner_token)
+         VALUES (?, (SELECT COALESCE(MAX(seq), 0) + 1 FROM jobs), ?, 'queued', ?, ?, ?, ?, ?)",
     )
     .bind(job.id.to_string())
     .bind(&job.name)
@@ -73,6 +75,7 @@ pub async fn insert(db: &mut SqliteConnection, job: &NewJobRow) -> sqlx::Result<
     .bind(job.dataset.to_string())
     .bind(&job.options)
     .bind(job.ignored)
+    .bind(job.owner_token.map(|token| token.to_string()))
     .execute(db)
     .await?;
     Ok(())
@@ -83,10 +86,17 @@ pub async fn find(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<Option<
     sqlx::query_as("SELECT * FROM jobs WHERE id = ?").bind(id.to_string()).fetch_optional(db).await
 }
 
-/// Jobs older than the one with `seq` `before`, newest first.
-pub async fn list(db: impl SqliteExecutor<'_>, before: i64, limit: u32) -> sqlx::Result<Vec<JobRow>> {
-    sqlx::query_as("SELECT * FROM jobs WHERE seq < ? ORDER BY seq DESC LIMIT ?")
+/// Jobs older than the one with `seq` `before`, newest first, of one token or of all.
+pub async fn list(
+    db: impl SqliteExecutor<'_>,
+    owner_token: Option<&str>,
+    before: i64,
+    limit: u32,
+) -> sqlx::Result<Vec<JobRow>> {
+    sqlx::query_as("SELECT * FROM jobs WHERE seq < ? AND (? IS NULL OR owner_token = ?) ORDER BY seq DESC LIMIT ?")
         .bind(before)
+        .bind(owner_token)
+        .bind(owner_token)
         .bind(limit)
         .fetch_all(db)
         .await

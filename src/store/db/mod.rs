@@ -11,6 +11,7 @@ pub mod job_images;
 pub mod job_outputs;
 pub mod job_stages;
 pub mod jobs;
+pub mod tokens;
 pub mod uploads;
 
 use std::path::Path;

@@ -28,13 +28,15 @@ pub struct UploadRow {
     pub path: Option<String>,
     /// Whether its bytes are in the dataset.
     pub stored: bool,
+    /// Whose it is.
+    pub owner_token: Option<String>,
 }
 
 /// Adds an upload.
 pub async fn insert(db: &mut SqliteConnection, upload: &UploadRow) -> sqlx::Result<()> {
     sqlx::query(
-        "INSERT INTO uploads (id, created_ms, expires_ms, kind, length, offset, metadata, concat, dataset_id, path, stored)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        "INSERT INTO uploads (id, created_ms, expires_ms, kind, length, offset, metadata, concat, dataset_id, path, stored,
+         owner_token) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
     )
     .bind(&upload.id)
     .bind(upload.created_ms)
@@ -47,6 +49,7 @@ pub async fn insert(db: &mut SqliteConnection, upload: &UploadRow) -> sqlx::Resu
     .bind(&upload.dataset_id)
     .bind(&upload.path)
     .bind(upload.stored)
+    .bind(&upload.owner_token)
     .execute(db)
     .await?;
     Ok(())
@@ -81,9 +84,9 @@ pub async fn expired(db: impl SqliteExecutor<'_>, now_ms: i64) -> sqlx::Result<V
     sqlx::query_scalar("SELECT id FROM uploads WHERE expires_ms <= ?").bind(now_ms).fetch_all(db).await
 }
 
-/// Every upload.
-pub async fn ids(db: impl SqliteExecutor<'_>) -> sqlx::Result<Vec<String>> {
-    sqlx::query_scalar("SELECT id FROM uploads").fetch_all(db).await
+/// Uploads whose bytes are still in their own file.
+pub async fn with_file(db: impl SqliteExecutor<'_>) -> sqlx::Result<Vec<String>> {
+    sqlx::query_scalar("SELECT id FROM uploads WHERE stored = 0").fetch_all(db).await
 }
 
 /// Bytes that open uploads have announced and not yet sent.
