@@ -17,6 +17,7 @@ use base64::prelude::BASE64_STANDARD;
 use reqwest::{Response, StatusCode};
 use serde_json::{Value, json};
 use sha2::Digest;
+use tokio::sync::watch;
 
 /// Kills of an ordinary test run.
 const KILLS: usize = 40;
@@ -26,6 +27,10 @@ const READY: Duration = Duration::from_secs(5);
 /// stages whose length the test can't know come to their end.
 const LIFE: [Duration; 2] = [Duration::from_millis(30), Duration::from_millis(1500)];
 const LONGER: f64 = 1.25;
+/// Every other life ends in one of these, in turn, so that the short ones are hit too, and within this time of its begin.
+const TARGETS: [&str; 8] =
+    ["outputs", "delete", "export", "add_points", "refine", "coarse_match", "add_cameras", "coarse_model"];
+const WITHIN: Duration = Duration::from_millis(40);
 
 struct Program {
     child: Child,
@@ -78,7 +83,7 @@ struct Client {
     outputs: Option<BTreeMap<String, String>>,
     deleted: bool,
     /// Where it was, for the tally of kills.
-    phase: String,
+    phase: watch::Sender<String>,
 }
 
 type Outcome<T> = Result<T, reqwest::Error>;
@@ -131,7 +136,7 @@ impl Client {
             assert!(offset >= *acknowledged, "{name}: {acknowledged} bytes were acknowledged, {offset} are there");
         }
         if let Some(job) = &self.job
-            && self.phase != "delete"
+            && *self.phase.borrow() != "delete"
         {
             let job = get(base, job).await?;
             assert!(job["state"] != "failed" && job["state"] != "cancelled", "{job:#}");
@@ -144,20 +149,20 @@ impl Client {
         self.check(base).await?;
         let http = reqwest::Client::new();
         if self.dataset.is_none() {
-            "dataset".clone_into(&mut self.phase);
+            self.phase.send_replace("dataset".to_owned());
             let answer = http.post(format!("{base}/api/v1/datasets")).json(&json!({})).send().await?;
             expect(&answer, &[201]);
             self.dataset = Some(answer.json::<Value>().await?["id"].as_str().unwrap().to_owned());
         }
         let dataset = self.dataset.clone().unwrap();
-        "upload".clone_into(&mut self.phase);
+        self.phase.send_replace("upload".to_owned());
         for (name, bytes) in self.photographs.clone() {
             if !self.stored.contains(&name) {
                 self.upload(&http, base, &dataset, &name, &bytes).await?;
             }
         }
         if self.job.is_none() {
-            "queue".clone_into(&mut self.phase);
+            self.phase.send_replace("queue".to_owned());
             // An answer may have been lost: the job is made once, by its name.
             let jobs = get(base, "/api/v1/jobs?limit=1000").await?;
             let mine: Vec<_> =
@@ -181,13 +186,13 @@ impl Client {
                 match job["state"].as_str().unwrap() {
                     "succeeded" => break,
                     "queued" | "running" => {
-                        self.phase = job["stage"]["name"].as_str().unwrap_or("queued").to_owned();
+                        self.phase.send_replace(job["stage"]["name"].as_str().unwrap_or("queued").to_owned());
                     }
                     _ => panic!("{job:#}"),
                 }
-                tokio::time::sleep(Duration::from_millis(20)).await;
+                tokio::time::sleep(Duration::from_millis(5)).await;
             }
-            "outputs".clone_into(&mut self.phase);
+            self.phase.send_replace("outputs".to_owned());
             let list = get(base, &format!("{link}/outputs")).await?;
             let files = list["files"].as_array().unwrap().iter();
             let tags = files
@@ -201,7 +206,7 @@ impl Client {
             self.outputs = Some(tags);
         }
         if !self.deleted {
-            "delete".clone_into(&mut self.phase);
+            self.phase.send_replace("delete".to_owned());
             let answer = http.delete(format!("{base}{link}")).send().await?;
             // Gone already when only the answer was lost.
             expect(&answer, &[204, 404]);
@@ -301,7 +306,7 @@ async fn nothing_acknowledged_is_lost_however_often_the_program_is_killed() {
 
     let folder = tempfile::tempdir().unwrap();
     let mut random = Random(7);
-    let (mut killed, mut rounds) = (0, 0);
+    let (mut killed, mut rounds, mut lives) = (0, 0, 0);
     let mut tally: BTreeMap<String, usize> = BTreeMap::new();
     while killed < kills {
         let mut client = Client::new(&photographs);
@@ -310,13 +315,26 @@ async fn nothing_acknowledged_is_lost_however_often_the_program_is_killed() {
             let program = Program::start(folder.path()).await;
             // Most moments are drawn from short lives: requests take milliseconds, stages seconds.
             let life = LIFE[0] + (LIFE[1] - LIFE[0]).mul_f64(random.unit().powi(2) * stretch);
-            let base = program.base.clone();
+            let (base, mut phase) = (program.base.clone(), client.phase.subscribe());
+            lives += 1;
+            let target = (lives % 2 == 0).then_some(TARGETS[lives / 2 % TARGETS.len()]);
+            let pause = WITHIN.mul_f64(random.unit());
+            let end = async {
+                match target {
+                    // The client holds the other end as long as this is waited for.
+                    Some(target) => {
+                        let _ = phase.wait_for(|phase| phase == target).await;
+                        tokio::time::sleep(pause).await;
+                    }
+                    None => tokio::time::sleep(life).await,
+                }
+            };
             let done = tokio::select! {
                 outcome = client.go_on(&base) => {
                     outcome.expect("nobody killed the service meanwhile");
                     true
                 }
-                () = tokio::time::sleep(life) => false,
+                () = end => false,
             };
             program.kill();
             if done {
@@ -324,7 +342,7 @@ async fn nothing_acknowledged_is_lost_however_often_the_program_is_killed() {
             }
             killed += 1;
             stretch *= LONGER;
-            *tally.entry(client.phase.clone()).or_insert(0) += 1;
+            *tally.entry(client.phase.borrow().clone()).or_insert(0) += 1;
         }
         rounds += 1;
         assert_eq!(client.outputs.as_ref(), Some(&expected), "round {rounds}: another model than undisturbed");

@@ -4,13 +4,15 @@
 //! synced side by side and committed in batches. A sender that stalls is given up, one that disconnects leaves nothing but
 //! photographs that sending again finds stored.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use axum::extract::Multipart;
+use axum::body::Body;
 use axum::extract::multipart::{Field, MultipartError};
+use axum::extract::{FromRequest, Multipart, Request};
 use axum::http::{HeaderMap, StatusCode, header};
 use bytes::Bytes;
+use futures_util::StreamExt;
 use tokio::sync::mpsc;
 use tokio::task::{JoinHandle, spawn_blocking};
 use uuid::Uuid;
@@ -26,6 +28,9 @@ const BATCH_FILES: usize = 32;
 const QUEUED_CHUNKS: usize = 8;
 /// Names of left-out files that are told; all are counted.
 const TOLD_NAMES: usize = 100;
+/// Bytes between two parts, and before the first: the head of a part, and what the reader takes ahead. The reader would keep the
+/// head of a part whole, however long.
+const MAX_HEAD_BYTES: u64 = 1 << 20;
 /// Bytes of the text parts.
 const MAX_TEXT_BYTES: usize = 256 << 10;
 
@@ -66,10 +71,53 @@ struct Intake {
     batch: Vec<JoinHandle<std::io::Result<StagedFile>>>,
 }
 
+/// The parts of a request's form, with a limit on what lies between them.
+pub(super) struct Parts {
+    multipart: Multipart,
+    between: Between,
+}
+
+/// Bytes the reader took since it began to look for a part; none while it reads one.
+type Between = Arc<Mutex<Option<u64>>>;
+
+impl Parts {
+    /// # Errors
+    /// When the request says that its body is no form.
+    pub(super) async fn of(request: Request) -> Result<Self, Problem> {
+        let between = Between::default();
+        let counted = Arc::clone(&between);
+        let request = request.map(|body| {
+            Body::from_stream(body.into_data_stream().map(move |chunk| {
+                let chunk = chunk?;
+                let mut taken = counted.lock().unwrap_or_else(PoisonError::into_inner);
+                if let Some(taken) = taken.as_mut() {
+                    *taken += chunk.len() as u64;
+                    if *taken > MAX_HEAD_BYTES {
+                        return Err(axum::Error::new("the head of a part is too long"));
+                    }
+                }
+                Ok(chunk)
+            }))
+        });
+        let multipart = Multipart::from_request(request, &())
+            .await
+            .map_err(|error| Problem::new(Code::InvalidMultipart).detail(error.body_text()))?;
+        Ok(Self { multipart, between })
+    }
+
+    async fn next(&mut self, idle: Duration) -> Result<Option<Field<'_>>, Problem> {
+        let count = |bytes| *self.between.lock().unwrap_or_else(PoisonError::into_inner) = bytes;
+        count(Some(0));
+        let field = in_time(idle, self.multipart.next_field()).await;
+        count(None);
+        field
+    }
+}
+
 /// Stores every photograph of a request in a dataset; the text parts are taken where `with_text` says so.
 pub(super) async fn receive(
     state: &AppState,
-    mut multipart: Multipart,
+    mut parts: Parts,
     dataset: Uuid,
     with_text: bool,
 ) -> Result<Received, Problem> {
@@ -86,7 +134,7 @@ pub(super) async fn receive(
         batch: Vec::new(),
     };
     loop {
-        let Some(field) = in_time(intake.idle, multipart.next_field()).await? else { break };
+        let Some(field) = parts.next(intake.idle).await? else { break };
         match field.name().unwrap_or("") {
             "images" => intake.photograph(field).await?,
             "archive" => intake.archive(field).await?,

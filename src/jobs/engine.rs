@@ -1,7 +1,5 @@
 //! What the executor runs: the pipeline in the service, something quick in tests.
 
-use serde::Deserialize;
-
 use crate::formats::report::Report;
 use crate::pipeline::{Context, PipelineError, ReconstructionOptions, RunPaths, reconstruct};
 
@@ -25,7 +23,8 @@ pub trait Engine: Send + Sync + 'static {
 pub struct PipelineEngine;
 
 fn parse(options: &serde_json::Value) -> Result<ReconstructionOptions, PipelineError> {
-    let options = ReconstructionOptions::deserialize(options)
+    // The path names the field: of `{"coarse": {"mapper": 3}}` it says `coarse.mapper: invalid type`.
+    let options: ReconstructionOptions = serde_path_to_error::deserialize(options)
         .map_err(|error| PipelineError::InvalidOptions(vec![error.to_string()]))?;
     options.validate()?;
     Ok(options)

@@ -86,6 +86,10 @@ pub fn unpack(
         return Err(ArchiveError::TooLarge(message));
     }
     let mut archive = ZipArchive::new(io::BufReader::new(file))?;
+    // The reader keeps the last of several entries with one name, and says nothing.
+    if archive.len() as u64 != entries {
+        return Err(ArchiveError::Invalid("its directory does not add up, or holds a name twice".to_owned()));
+    }
     let mut ignored = Vec::new();
     let mut photographs = Vec::new();
     for index in 0..archive.len() {
@@ -112,13 +116,13 @@ pub fn unpack(
     let mut chunk = vec![0; CHUNK_BYTES];
     for (index, path) in photographs {
         let mut entry = archive.by_index(index)?;
+        let declared = entry.size();
         let mut writer = StagedWriter::create(scratch)?;
         loop {
-            let read = entry.read(&mut chunk).map_err(|error| match error.kind() {
-                io::ErrorKind::InvalidData | io::ErrorKind::InvalidInput | io::ErrorKind::UnexpectedEof => {
-                    ArchiveError::Invalid(format!("{path}: {error}"))
-                }
-                _ => ArchiveError::from(error),
+            // What the system did not say, the archive is to blame for.
+            let read = entry.read(&mut chunk).map_err(|error| match error.raw_os_error() {
+                Some(_) => ArchiveError::from(error),
+                None => ArchiveError::Invalid(format!("{path}: {error}")),
             })?;
             if read == 0 {
                 break;
@@ -128,6 +132,9 @@ pub fn unpack(
                 return Err(ArchiveError::TooLarge(format!("{path} unpacks to more than is taken")));
             }
             writer.write(&chunk[..read])?;
+        }
+        if writer.size_bytes() != declared {
+            return Err(ArchiveError::Invalid(format!("{path} has not the length that its entry states")));
         }
         emit(writer.finish(path)?)?;
     }

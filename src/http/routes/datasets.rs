@@ -1,7 +1,7 @@
 //! Datasets: make, list, look at, fill, delete.
 
 use axum::Router;
-use axum::extract::{FromRequest, Multipart, Request, State};
+use axum::extract::{Request, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
@@ -11,7 +11,7 @@ use uuid::Uuid;
 use crate::http::access::Principal;
 use crate::http::extract::{DatasetId, Json, Page, Query, cut, media_type};
 use crate::http::problem::{Code, Problem};
-use crate::http::upload::receive;
+use crate::http::upload::{Parts, receive};
 use crate::http::{AppState, wire};
 use crate::jobs::MAX_NAME_CHARS;
 use crate::store::db::datasets::DatasetRow;
@@ -110,10 +110,8 @@ async fn add_images(
         return Err(Problem::new(Code::UnsupportedMediaType).detail("the body must be multipart/form-data"));
     }
     find(&state, id).await?;
-    let multipart = Multipart::from_request(request, &state)
-        .await
-        .map_err(|error| Problem::new(Code::InvalidMultipart).detail(error.body_text()))?;
-    let received = receive(&state, multipart, id, false).await?;
+    let parts = Parts::of(request).await?;
+    let received = receive(&state, parts, id, false).await?;
     let result = wire::UploadResult {
         stored: received.stored,
         unchanged: received.unchanged,

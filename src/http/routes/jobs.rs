@@ -1,7 +1,7 @@
 //! Jobs: make, list, look at, cancel, resume, delete.
 
 use axum::Router;
-use axum::extract::{FromRequest, Multipart, Request, State};
+use axum::extract::{FromRequest, Request, State};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
@@ -11,7 +11,7 @@ use uuid::Uuid;
 use crate::http::access::Principal;
 use crate::http::extract::{JobId, Json, Page, Query, cut, media_type};
 use crate::http::problem::{Code, Problem};
-use crate::http::upload::{Received, receive};
+use crate::http::upload::{Parts, Received, receive};
 use crate::http::{AppState, wire};
 use crate::jobs::{Jobs, NewJob};
 use crate::store::db::jobs::JobRow;
@@ -96,10 +96,8 @@ struct NewJobBody {
 async fn create(State(state): State<AppState>, principal: Principal, request: Request) -> Result<Response, Problem> {
     let row = match media_type(request.headers()).as_str() {
         "multipart/form-data" => {
-            let multipart = Multipart::from_request(request, &state)
-                .await
-                .map_err(|error| Problem::new(Code::InvalidMultipart).detail(error.body_text()))?;
-            create_with_upload(&state, &principal, multipart).await?
+            let parts = Parts::of(request).await?;
+            create_with_upload(&state, &principal, parts).await?
         }
         "application/json" => {
             let Json(body): Json<NewJobBody> = Json::from_request(request, &state).await?;
@@ -147,13 +145,13 @@ impl Drop for OwnDataset {
     }
 }
 
-async fn create_with_upload(state: &AppState, principal: &Principal, multipart: Multipart) -> Result<JobRow, Problem> {
+async fn create_with_upload(state: &AppState, principal: &Principal, parts: Parts) -> Result<JobRow, Problem> {
     let (id, dataset) = (Uuid::now_v7(), Uuid::now_v7());
     let mut tx = state.jobs.store.db.write().await?;
     datasets::insert(&mut tx, dataset, "", now_ms(), Some(id), principal.owner()).await?;
     tx.commit().await?;
     let mut own = OwnDataset { jobs: state.jobs.clone(), dataset, kept: false };
-    let received = receive(state, multipart, dataset, true).await?;
+    let received = receive(state, parts, dataset, true).await?;
     let options = options_of(&received)?;
     let name = received.name.unwrap_or_default();
     let (ignored, owner_token) = (Some(received.ignored), principal.owner());
