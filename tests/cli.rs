@@ -8,6 +8,8 @@ mod bad_pictures;
 mod determinism;
 #[path = "cli/evaluate.rs"]
 mod evaluate;
+#[path = "cli/look_alikes.rs"]
+mod look_alikes;
 #[path = "cli/reconstruct.rs"]
 mod reconstruct;
 #[path = "cli/rendered.rs"]

@@ -79,7 +79,7 @@ pub fn localize_image(
     let intrinsics = if cameras.is_empty() { Intrinsics::Unused(&query.camera) } else { Intrinsics::Shared(&cameras) };
     let mut failure: Option<LocalizeFailure> = None;
     for (turn, &method) in (0u64..).zip(&options.methods) {
-        let correspondences = match method {
+        let mut correspondences = match method {
             LocalizationMethod::ActiveSearch => active_search(snapshot, features, &options.active_search),
             LocalizationMethod::DirectMatch => direct_match(snapshot, features, &options.direct_match),
             LocalizationMethod::RankedMatch => {
@@ -87,6 +87,7 @@ pub fn localize_image(
                 ranked_match(model, features, &ranked, load, &options.ranked_match)
             }
         };
+        correspondences.retain(|seen| !model.apart_from_track(query.image, seen.point));
         let mut pose_options = options.pose.clone();
         if method == LocalizationMethod::RankedMatch {
             pose_options.min_correspondences = pose_options.min_correspondences.max(options.ranked_match.more_than + 1);

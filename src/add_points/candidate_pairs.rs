@@ -34,7 +34,7 @@ struct Neighbor {
     shared: usize,
 }
 
-/// The pairs to match, each once, by ascending ids. With `new_images`, only pairs with at least one of them (the paper's
+/// The pairs to match, each once, by ascending ids; none of images that are known to be apart. With `new_images`, only pairs with at least one of them (the paper's
 /// second iteration).
 pub fn candidate_pairs(
     model: &Reconstruction,
@@ -59,7 +59,7 @@ pub fn candidate_pairs(
         for neighbor in chosen {
             let (first, second) = (ids[rank.min(neighbor.rank)], ids[rank.max(neighbor.rank)]);
             let wanted = new_images.is_none_or(|new| new.contains(&first) || new.contains(&second));
-            if wanted {
+            if wanted && !model.apart.are_apart(first, second) {
                 let shared_points = covisible[rank].iter().find(|n| n.rank == neighbor.rank).map_or(0, |n| n.shared);
                 pairs.insert((first, second), shared_points);
             }

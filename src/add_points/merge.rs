@@ -15,7 +15,7 @@ use super::options::TriangulationOptions;
 use super::triangulate::{StarTrack, refit};
 use super::views::{Sighting, ViewTable};
 use crate::math::UnionFind;
-use crate::scene::{Observation, Point3dId, Reconstruction};
+use crate::scene::{ImageId, Observation, Point3dId, Reconstruction};
 
 /// What merging makes of a component: a new point, or a point of the model with a new position and track.
 #[derive(Clone, Debug, PartialEq)]
@@ -154,7 +154,9 @@ impl<'a> Resolver<'a> {
         let mut images: Vec<u32> = own.iter().map(|seen| seen.rank).collect();
         for &other in &self.points {
             let track = track_of(self.model, other).iter().map(|observation| self.table.sighting(observation));
+            let apart = |seen: &Observation| owners.iter().any(|&owner| self.model.apart_from_track(seen.image, owner));
             let joins = other != id
+                && !track_of(self.model, other).iter().any(apart)
                 && track.clone().all(|seen| {
                     !images.contains(&seen.rank)
                         && !self.is_taken(seen)
@@ -166,7 +168,7 @@ impl<'a> Resolver<'a> {
             }
         }
         let grant = |xyz: &Vector3<f64>| {
-            self.best_per_image(xyz, |claim| claim.owner.is_none_or(|owner| owners.contains(&owner)))
+            self.best_per_image(xyz, Some(id), |claim| claim.owner.is_none_or(|owner| owners.contains(&owner)))
         };
         let granted = refit(self.table, point.xyz, grant);
         let kept = |track: &[Sighting]| own.iter().filter(|seen| track.binary_search(seen).is_ok()).count();
@@ -191,7 +193,7 @@ impl<'a> Resolver<'a> {
         if star.sightings.iter().filter(free).count() < 2 {
             return None;
         }
-        let grant = |xyz: &Vector3<f64>| self.best_per_image(xyz, |claim| claim.owner.is_none());
+        let grant = |xyz: &Vector3<f64>| self.best_per_image(xyz, None, |claim| claim.owner.is_none());
         let (xyz, track) = refit(self.table, star.xyz, grant)?;
         if !self.is_good(&xyz, &track, star.distinctive) {
             return None;
@@ -200,8 +202,14 @@ impl<'a> Resolver<'a> {
         Some(self.update(None, Vec::new(), xyz, &track))
     }
 
-    /// The free sightings that agree with a position, of each image the one with the smallest error, sorted.
-    fn best_per_image(&self, xyz: &Vector3<f64>, allowed: impl Fn(&Claim) -> bool) -> Vec<Sighting> {
+    /// The free sightings that agree with a position, of each image the one with the smallest error, sorted. Where images are
+    /// apart, those of `point` stay, then those with the smaller error.
+    fn best_per_image(
+        &self,
+        xyz: &Vector3<f64>,
+        point: Option<Point3dId>,
+        allowed: impl Fn(&Claim) -> bool,
+    ) -> Vec<Sighting> {
         let mut best: Vec<(Sighting, f64)> = Vec::new();
         for claim in self.claims.iter().filter(|claim| !claim.taken && allowed(claim)) {
             let error = self.table.relative_error_sq(claim.seen, xyz);
@@ -217,7 +225,27 @@ impl<'a> Resolver<'a> {
                 _ => best.push((claim.seen, error)),
             }
         }
+        if !self.model.apart.is_empty() {
+            best = self.of_one_place(best, point);
+        }
         best.into_iter().map(|(seen, _)| seen).collect()
+    }
+
+    /// What stays of sightings with their errors when no two may be of images apart.
+    fn of_one_place(&self, mut sightings: Vec<(Sighting, f64)>, point: Option<Point3dId>) -> Vec<(Sighting, f64)> {
+        let foreign = |seen: Sighting| point.is_none() || self.claim(seen).is_none_or(|claim| claim.owner != point);
+        sightings.sort_by(|a, b| foreign(a.0).cmp(&foreign(b.0)).then(a.1.total_cmp(&b.1)).then(a.0.cmp(&b.0)));
+        let mut images: Vec<ImageId> = Vec::new();
+        sightings.retain(|&(seen, _)| {
+            let image = self.table.observation(seen).image;
+            let stays = !self.model.apart.from_any(image, images.iter().copied());
+            if stays {
+                images.push(image);
+            }
+            stays
+        });
+        sightings.sort_by_key(|&(seen, _)| seen);
+        sightings
     }
 
     /// Whether a track fixes a new point well enough.

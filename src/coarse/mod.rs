@@ -1,9 +1,10 @@
-//! Coarse model estimation (paper, section 4): select and match the features of the largest scales, then reconstruct the
-//! match graph incrementally, one model per connected component.
+//! Coarse model estimation (paper, section 4): select and match the features of the largest scales, cut pairs that join
+//! look-alike places out of the match graph, then reconstruct it incrementally, one model per connected component.
 
 mod filter;
 pub mod hybrid_match;
 mod intrinsics;
+pub mod look_alikes;
 mod mapper;
 mod match_graph;
 pub mod pair_selection;

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 use super::MatchGraph;
 use crate::math::UnionFind;
-use crate::scene::{ImageId, KeypointIdx, Observation};
+use crate::scene::{ApartImages, ImageId, KeypointIdx, Observation};
 
 /// All tracks of a match graph.
 #[derive(Clone, Debug, Default)]
@@ -20,8 +20,49 @@ pub struct Tracks {
 }
 
 impl Tracks {
-    /// Builds the tracks of a graph.
-    pub fn build(graph: &MatchGraph) -> Self {
+    /// Builds the tracks of a graph, none of which joins images that are apart.
+    pub fn build(graph: &MatchGraph, apart: &ApartImages) -> Self {
+        let mut builder = TrackBuilder::new(graph, apart);
+        let mut order: Vec<_> = graph.pairs.iter().collect();
+        order.sort_by_key(|(_, geometry)| std::cmp::Reverse(geometry.inliers.len()));
+        for (&(a, b), geometry) in order {
+            for &(in_a, in_b) in &geometry.inliers {
+                builder.join(Observation { image: a, keypoint: in_a }, Observation { image: b, keypoint: in_b });
+            }
+        }
+        builder.finish()
+    }
+
+    /// The tracked keypoints of an image with their tracks.
+    pub fn of(&self, image: ImageId) -> &[(KeypointIdx, usize)] {
+        self.of_image.get(&image).map_or(&[], Vec::as_slice)
+    }
+}
+
+/// How two sightings stand to each other while tracks grow.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Relation {
+    /// They are in one track.
+    Joined,
+    /// Both are in tracks, of no image in common, that could be one.
+    Open,
+    /// One of them is in no track yet.
+    Fresh,
+    /// Their tracks meet in an image, at two keypoints: they can't be one point.
+    Forked,
+}
+
+/// Tracks that grow match by match.
+pub(super) struct TrackBuilder<'a> {
+    apart: &'a ApartImages,
+    nodes: Vec<Observation>,
+    sets: UnionFind,
+    images_of_root: Vec<Vec<ImageId>>,
+}
+
+impl<'a> TrackBuilder<'a> {
+    /// Every matched keypoint of the graph as a track of its own.
+    pub(super) fn new(graph: &MatchGraph, apart: &'a ApartImages) -> Self {
         let mut nodes: Vec<Observation> = Vec::new();
         for (&(a, b), geometry) in &graph.pairs {
             for &(in_a, in_b) in &geometry.inliers {
@@ -31,34 +72,55 @@ impl Tracks {
         }
         nodes.sort_unstable();
         nodes.dedup();
-        let node = |seen: Observation| nodes.binary_search(&seen).expect("every matched keypoint is a node");
-
-        let mut order: Vec<_> = graph.pairs.iter().collect();
-        order.sort_by_key(|(_, geometry)| std::cmp::Reverse(geometry.inliers.len()));
-        let mut sets = UnionFind::new(nodes.len());
-        let mut images_of_root: Vec<Vec<ImageId>> = nodes.iter().map(|seen| vec![seen.image]).collect();
-        for (&(a, b), geometry) in order {
-            for &(in_a, in_b) in &geometry.inliers {
-                let (root_a, root_b) = (
-                    sets.find(node(Observation { image: a, keypoint: in_a })),
-                    sets.find(node(Observation { image: b, keypoint: in_b })),
-                );
-                if root_a == root_b {
-                    continue;
-                }
-                if let Some(joined) = merge_disjoint(&images_of_root[root_a], &images_of_root[root_b]) {
-                    sets.union(root_a, root_b);
-                    images_of_root[root_a] = Vec::new();
-                    images_of_root[root_b] = Vec::new();
-                    images_of_root[sets.find(root_a)] = joined;
-                }
-            }
+        Self {
+            apart,
+            sets: UnionFind::new(nodes.len()),
+            images_of_root: nodes.iter().map(|seen| vec![seen.image]).collect(),
+            nodes,
         }
+    }
 
-        let mut tracks = Self::default();
-        for set in sets.sets().into_iter().filter(|set| set.len() >= 2) {
+    fn roots(&mut self, a: Observation, b: Observation) -> (usize, usize) {
+        let [a, b] = [a, b].map(|seen| self.nodes.binary_search(&seen).expect("every matched keypoint is a node"));
+        (self.sets.find(a), self.sets.find(b))
+    }
+
+    /// How two matched keypoints stand to each other so far.
+    pub(super) fn relation(&mut self, a: Observation, b: Observation) -> Relation {
+        let (root_a, root_b) = self.roots(a, b);
+        if root_a == root_b {
+            Relation::Joined
+        } else if self.images_of_root[root_a].len() == 1 || self.images_of_root[root_b].len() == 1 {
+            Relation::Fresh
+        } else if merge_disjoint(&self.images_of_root[root_a], &self.images_of_root[root_b]).is_some() {
+            Relation::Open
+        } else {
+            Relation::Forked
+        }
+    }
+
+    /// Joins the tracks of two matched keypoints, unless they meet in an image or hold images that are apart.
+    pub(super) fn join(&mut self, a: Observation, b: Observation) {
+        let (root_a, root_b) = self.roots(a, b);
+        let (images_a, images_b) = (&self.images_of_root[root_a], &self.images_of_root[root_b]);
+        let apart = |&image: &ImageId| self.apart.from_any(image, images_b.iter().copied());
+        if root_a == root_b || images_a.iter().any(apart) {
+            return;
+        }
+        if let Some(joined) = merge_disjoint(&self.images_of_root[root_a], &self.images_of_root[root_b]) {
+            self.sets.union(root_a, root_b);
+            self.images_of_root[root_a] = Vec::new();
+            self.images_of_root[root_b] = Vec::new();
+            self.images_of_root[self.sets.find(root_a)] = joined;
+        }
+    }
+
+    /// The tracks of at least two sightings.
+    pub(super) fn finish(mut self) -> Tracks {
+        let mut tracks = Tracks::default();
+        for set in self.sets.sets().into_iter().filter(|set| set.len() >= 2) {
             let rank = tracks.tracks.len();
-            let track: Vec<Observation> = set.into_iter().map(|at| nodes[at]).collect();
+            let track: Vec<Observation> = set.into_iter().map(|at| self.nodes[at]).collect();
             for seen in &track {
                 tracks.of_image.entry(seen.image).or_default().push((seen.keypoint, rank));
             }
@@ -68,11 +130,6 @@ impl Tracks {
             keypoints.sort_unstable();
         }
         tracks
-    }
-
-    /// The tracked keypoints of an image with their tracks.
-    pub fn of(&self, image: ImageId) -> &[(KeypointIdx, usize)] {
-        self.of_image.get(&image).map_or(&[], Vec::as_slice)
     }
 }
 

@@ -29,6 +29,8 @@ pub struct Report {
     pub models: Vec<ModelReport>,
     /// Every input image, in name order.
     pub images: Vec<ImageReport>,
+    /// Pairs of photographs that match but show different places, and were cut.
+    pub look_alikes: Vec<LookAlikePair>,
     /// Plain sentences a person should read: what was widened, cut or left out, and why.
     pub notes: Vec<String>,
 }
@@ -66,6 +68,27 @@ pub struct StageReport {
     pub reused: bool,
     /// Named counts: pairs tried, pairs verified, images added, points before and after, ...
     pub counts: BTreeMap<String, f64>,
+}
+
+/// A pair that was cut because its photographs show different places that look alike.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LookAlikePair {
+    /// Name of the one photograph.
+    pub first: String,
+    /// Name of the other.
+    pub second: String,
+    /// Its verified matches.
+    pub matches: usize,
+    /// Of those, how many join what the stronger pairs hold for one point too.
+    pub agreeing: usize,
+    /// Share of what the photographs show that the pair matches, 0 to 1.
+    pub strength: f64,
+    /// The weakest link of the strongest chain of pairs between the two, on the same scale.
+    pub chain_strength: f64,
+    /// Median distance between the two places, in units of their distance from the camera; null where it is not known.
+    pub displacement: Option<f64>,
+    /// Whether the two are held apart for good: no point is seen by both.
+    pub apart: bool,
 }
 
 /// One model (connected component).

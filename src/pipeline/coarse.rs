@@ -17,12 +17,13 @@ use super::{Context, PipelineError, Stage, StageKey, focals};
 use crate::add_cameras::MatchCounts;
 use crate::camera::{Camera, FocalSource, Pixel};
 use crate::coarse::hybrid_match::{CoarseDescriptors, match_hybrid};
+use crate::coarse::look_alikes::{self, CutPair, LookAlikeAccount};
 use crate::coarse::pair_selection::{GeoPosition, PairingImage, select_pairs};
 use crate::coarse::selection::SelectionOptions;
-use crate::coarse::{self, CoarseModels, MapperImage, MapperInput, MatchGraph};
+use crate::coarse::{CoarseModels, MapperImage, MapperInput, MatchGraph};
 use crate::matching::two_view::{self, TwoViewGeometry};
 use crate::math::Rng;
-use crate::scene::{CameraId, Features, ImageId, KeypointIdx};
+use crate::scene::{ApartImages, CameraId, Features, ImageId, KeypointIdx};
 
 /// Number of coarse matches of every pair that was matched, verified or not: what ranked matching goes by.
 pub type PairMatchCounts = MatchCounts;
@@ -35,6 +36,8 @@ pub struct Coarse {
     pub match_counts: PairMatchCounts,
     /// Intrinsics as far as the pairs tell them.
     pub cameras: BTreeMap<CameraId, Camera>,
+    /// Pairs that were cut as look-alikes.
+    pub cut: Vec<CutPair>,
 }
 
 /// The result of `coarse_match`.
@@ -65,14 +68,14 @@ pub fn run(
 ) -> Result<Coarse, PipelineError> {
     let context = runner.context;
     let usable = found.values().filter(|image| matches!(image.count, Ok(count) if count > 0)).count();
-    let mut best: Option<(usize, CoarseModels)> = None;
+    let mut best: Option<(CoarseModels, LookAlikeAccount)> = None;
     let mut before = CoarseMatches::default();
     let selections = std::iter::successors(Some(options.coarse.selection.clone()), SelectionOptions::widened);
     for (round, selection) in (1u32..).zip(selections) {
         let iteration = (round > 1).then_some(round);
         let settled = best
             .as_ref()
-            .and_then(|(_, models)| models.models.first())
+            .and_then(|(models, _)| models.models.first())
             .map(|model| model.images().keys().copied().collect());
         let match_key = ArtifactKey::of("coarse_match", &[&base_key.0, &selection]);
         let matches: CoarseMatches = runner.stage(
@@ -90,18 +93,33 @@ pub fn run(
         )?;
         let model_key = ArtifactKey::of("coarse_model", &[&match_key.0]);
         let stage = StageKey { stage: Stage::CoarseModel, iteration };
-        let models: CoarseModels = runner.stage(stage, Some(&model_key), usable as u64, |store, progress| {
-            let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
-            let input = mapper_input(intake, &cache, &matches);
-            cache.check(Stage::CoarseModel)?;
-            let keep_going = || !context.cancel.is_cancelled();
-            let told = |registered: usize| progress.set(registered as u64, usable as u64);
-            let models = coarse::reconstruct(&input, &options.coarse.mapper, context.seed, &keep_going, &told);
-            context.check_cancelled()?;
-            let points = models.models.iter().map(|model| model.num_points()).sum();
-            let totals = counts([("images", registered(&models)), ("models", models.models.len()), ("points", points)]);
-            Ok((models, totals))
-        })?;
+        let (models, account): (CoarseModels, LookAlikeAccount) =
+            runner.stage(stage, Some(&model_key), usable as u64, |store, progress| {
+                let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
+                let input = mapper_input(intake, &cache, &matches);
+                cache.check(Stage::CoarseModel)?;
+                let keep_going = || !context.cancel.is_cancelled();
+                let told = |registered: usize| progress.set(registered as u64, usable as u64);
+                let coarse = &options.coarse;
+                let (models, account) = look_alikes::reconstruct(
+                    &input,
+                    &coarse.look_alikes,
+                    &coarse.mapper,
+                    context.seed,
+                    &keep_going,
+                    &told,
+                );
+                context.check_cancelled()?;
+                let points = models.models.iter().map(|model| model.num_points()).sum();
+                let totals = counts([
+                    ("images", registered(&models)),
+                    ("models", models.models.len()),
+                    ("points", points),
+                    ("pairs_doubted", account.suspected),
+                    ("pairs_cut", account.cut.len()),
+                ]);
+                Ok(((models, account), totals))
+            })?;
         for note in &matches.notes {
             if !notes.contains(note) {
                 notes.push(note.clone());
@@ -109,8 +127,8 @@ pub fn run(
         }
         let largest = |models: &CoarseModels| models.models.first().map_or(0, |model| model.images().len());
         let reached = largest(&models);
-        if best.as_ref().is_none_or(|(_, best)| (reached, registered(&models)) > (largest(best), registered(best))) {
-            best = Some((round as usize, models));
+        if best.as_ref().is_none_or(|(best, _)| (reached, registered(&models)) > (largest(best), registered(best))) {
+            best = Some((models, account));
         }
         before = matches;
         if reached as f64 >= options.coarse.enough_registered * usable as f64 {
@@ -123,7 +141,8 @@ pub fn run(
             if selection.widened().is_some() { "; a larger share was tried after that" } else { ", and these are all features" }
         ));
     }
-    let models = best.map(|(_, models)| models).unwrap_or_default();
+    let (models, account) = best.unwrap_or_default();
+    notes.extend(look_alike_note(&account, intake));
     let mut state = PipelineState {
         models: models
             .models
@@ -134,7 +153,38 @@ pub fn run(
         most_alike: most_alike(&before.graph),
     };
     state.record(key(Stage::CoarseModel));
-    Ok(Coarse { state, match_counts: before.match_counts, cameras: before.cameras })
+    Ok(Coarse { state, match_counts: before.match_counts, cameras: before.cameras, cut: account.cut })
+}
+
+/// Pairs a note names; the report lists them all.
+const NAMED_PAIRS: usize = 5;
+
+/// What was cut, strongest first, and why.
+fn look_alike_note(account: &LookAlikeAccount, intake: &Intake) -> Option<String> {
+    if account.cut.is_empty() {
+        return None;
+    }
+    let mut strongest: Vec<&CutPair> = account.cut.iter().collect();
+    strongest.sort_by_key(|cut| (std::cmp::Reverse(cut.matches), cut.images));
+    let named: Vec<String> = strongest
+        .iter()
+        .take(NAMED_PAIRS)
+        .map(|cut| {
+            let why = cut.displacement.map_or_else(
+                || "no stronger pairs confirm them".to_owned(),
+                |displacement| format!("the places lie {displacement:.2} camera distances apart"),
+            );
+            let (a, b) = (intake.name(cut.images.0), intake.name(cut.images.1));
+            format!("{a} and {b} ({} matches; {why})", cut.matches)
+        })
+        .collect();
+    Some(format!(
+        "{} pairs of photographs match although stronger chains of pairs say that they show different places that look \
+         alike. They were left out: {}{}.",
+        account.cut.len(),
+        named.join(", "),
+        if account.cut.len() > NAMED_PAIRS { ", ..." } else { "" }
+    ))
 }
 
 /// The image that each image shares most verified matches with; of equals the first.
@@ -160,7 +210,12 @@ fn mapper_input(intake: &Intake, cache: &FeatureCache<'_>, matches: &CoarseMatch
         let camera = photograph.camera;
         (id, MapperImage { camera, keypoints: positions(cache, id) })
     });
-    MapperInput { images: images.collect(), cameras: matches.cameras.clone(), graph: matches.graph.clone() }
+    MapperInput {
+        images: images.collect(),
+        cameras: matches.cameras.clone(),
+        graph: matches.graph.clone(),
+        apart: ApartImages::default(),
+    }
 }
 
 /// The position of every keypoint of an image.

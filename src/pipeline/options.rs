@@ -12,6 +12,7 @@ use crate::bundle::BundleOptions;
 use crate::camera::CameraModel;
 use crate::coarse::MapperOptions;
 use crate::coarse::hybrid_match::HybridMatchOptions;
+use crate::coarse::look_alikes::LookAlikeOptions;
 use crate::coarse::pair_selection::PairSelectionOptions;
 use crate::coarse::selection::SelectionOptions;
 use crate::features::SiftOptions;
@@ -120,6 +121,8 @@ pub struct CoarseOptions {
     pub two_view: TwoViewOptions,
     /// When votes of pairs settle a focal length.
     pub focals: FocalOptions,
+    /// Which verified pairs are cut because they show different places that look alike.
+    pub look_alikes: LookAlikeOptions,
     /// Incremental structure from motion.
     pub mapper: MapperOptions,
     /// Share of the readable images that must come into the largest model for the selection to stay as it is; below, it is
@@ -135,6 +138,7 @@ impl Default for CoarseOptions {
             matching: HybridMatchOptions::default(),
             two_view: TwoViewOptions::default(),
             focals: FocalOptions::default(),
+            look_alikes: LookAlikeOptions::default(),
             mapper: MapperOptions::default(),
             enough_registered: 0.8,
         }
@@ -188,6 +192,7 @@ impl ReconstructionOptions {
         self.coarse.matching.validate(&mut errors);
         self.coarse.two_view.validate(&mut errors);
         self.coarse.focals.validate(&mut errors);
+        self.coarse.look_alikes.validate(&mut errors);
         self.coarse.mapper.validate(&mut errors);
         self.add_cameras.validate(&mut errors);
         self.add_points.validate(&mut errors);

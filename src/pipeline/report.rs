@@ -9,7 +9,8 @@ use super::options::ReconstructionOptions;
 use super::state::{ModelState, PipelineState, mean_and_median};
 use super::{Context, verdict};
 use crate::camera::FocalSource;
-use crate::formats::report::{InputSummary, ModelReport, Report, Software, StageReport};
+use crate::coarse::look_alikes::CutPair;
+use crate::formats::report::{InputSummary, LookAlikePair, ModelReport, Report, Software, StageReport};
 use crate::scene::{CameraId, ImageId};
 
 /// The report of a finished run.
@@ -22,6 +23,7 @@ pub fn build(
     state: &PipelineState,
     stages: Vec<StageReport>,
     notes: Vec<String>,
+    cut: &[CutPair],
     watch: &Stopwatch,
 ) -> Report {
     let pixels: f64 = intake.files.iter().filter_map(|file| file.size).map(|(w, h)| f64::from(w) * f64::from(h)).sum();
@@ -37,6 +39,7 @@ pub fn build(
         stages,
         models: state.models.iter().enumerate().map(|(id, account)| model_report(id, account)).collect(),
         images: verdict::verdicts(intake, features, state),
+        look_alikes: cut.iter().map(|cut| look_alike_pair(intake, cut)).collect(),
         notes,
     }
 }
@@ -66,6 +69,19 @@ pub fn principal_point_notes(models: &[ModelState]) -> Vec<String> {
 
 /// A principal point that far from the middle, seen as an angle, is worth a note.
 const NOTED_TURN_DEG: f64 = 0.25;
+
+fn look_alike_pair(intake: &Intake, cut: &CutPair) -> LookAlikePair {
+    LookAlikePair {
+        first: intake.name(cut.images.0).to_owned(),
+        second: intake.name(cut.images.1).to_owned(),
+        matches: cut.matches,
+        agreeing: cut.agreeing,
+        strength: cut.strength,
+        chain_strength: cut.chain_strength,
+        displacement: cut.displacement,
+        apart: cut.apart,
+    }
+}
 
 fn model_report(id: usize, ModelState { model, history, .. }: &ModelState) -> ModelReport {
     let (mean, median) = mean_and_median(model.reprojection_errors_px());

@@ -14,6 +14,7 @@ use super::state::{ModelState, PipelineState};
 use super::{Context, PipelineError, ProgressEvent, Stage, StageKey, coarse, export, refine, report};
 use crate::add_points;
 use crate::coarse::Unregistered;
+use crate::coarse::look_alikes::CutPair;
 use crate::formats::report::Report;
 use crate::scene::{Features, ImageId, world_frame};
 
@@ -83,7 +84,7 @@ impl Pipeline<'_> {
         let mut notes = Vec::new();
         let mut models_key = ArtifactKey::of("coarse", &[&input_key.0, &options.coarse]);
         let coarse = coarse::run(&mut runner, &intake, &found, options, &models_key, &mut notes)?;
-        let (mut state, match_counts, cameras) = (coarse.state, coarse.match_counts, coarse.cameras);
+        let coarse::Coarse { mut state, match_counts, cameras, cut } = coarse;
 
         let mut placed_before: Option<BTreeSet<ImageId>> = None;
         for iteration in 1..=options.iterations {
@@ -142,7 +143,7 @@ impl Pipeline<'_> {
                 })?;
         }
 
-        self.finish(runner, watch, &intake, &found, state, notes)
+        self.finish(runner, watch, &intake, &found, state, (notes, &cut))
     }
 
     /// The stages ahead.
@@ -213,7 +214,7 @@ impl Pipeline<'_> {
         intake: &Intake,
         found: &BTreeMap<ImageId, ImageFeatures>,
         mut state: PipelineState,
-        mut notes: Vec<String>,
+        (mut notes, cut): (Vec<String>, &[CutPair]),
     ) -> Result<Report, PipelineError> {
         let orientation: BTreeMap<ImageId, u8> =
             intake.photographs().filter_map(|(id, _, photograph)| Some((id, photograph.exif.orientation?))).collect();
@@ -241,7 +242,8 @@ impl Pipeline<'_> {
             (exported.unwrap_or_default(), thumbnails)
         };
         notes.extend(report::principal_point_notes(&state.models));
-        let report = report::build(self.options, self.context, intake, found, &state, runner.stages, notes, &watch);
+        let report =
+            report::build(self.options, self.context, intake, found, &state, runner.stages, notes, cut, &watch);
         export::write_reports(self.paths, &report, &state, intake, &thumbnails)?;
         Ok(report)
     }

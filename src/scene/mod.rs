@@ -1,11 +1,13 @@
 //! What the stages pass on: ids, rasters, features, and the reconstruction (cameras, registered images, points, tracks).
 
+mod apart;
 mod features;
 mod ids;
 mod raster;
 mod reconstruction;
 pub mod world_frame;
 
+pub use apart::ApartImages;
 pub use features::{DESCRIPTOR_LEN, Descriptor, Features, Keypoint};
 pub use ids::{CameraId, ImageId, KeypointIdx, Point3dId};
 pub use raster::{GrayImage, RgbImage};

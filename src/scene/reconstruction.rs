@@ -6,7 +6,7 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use super::{CameraId, ImageId, KeypointIdx, Point3dId};
+use super::{ApartImages, CameraId, ImageId, KeypointIdx, Point3dId};
 use crate::camera::{Camera, Pixel};
 use crate::geometry::Rigid3;
 
@@ -65,6 +65,8 @@ pub struct Point3d {
 pub struct Reconstruction {
     /// Intrinsics by id.
     pub cameras: BTreeMap<CameraId, Camera>,
+    /// Images, registered or not, that show different places that look alike: no track joins two of them.
+    pub apart: ApartImages,
     images: BTreeMap<ImageId, RegisteredImage>,
     points: Vec<Option<Point3d>>,
     num_points: usize,
@@ -204,10 +206,13 @@ impl Reconstruction {
         }
     }
 
-    /// Adds a sighting to a point; false (and no change) when the track already sees the image or the keypoint already
-    /// sees a point.
+    /// Adds a sighting to a point; false (and no change) when the track already sees the image, the keypoint already sees a
+    /// point, or the track holds an image apart from this one.
     pub fn add_observation(&mut self, id: Point3dId, observation: Observation) -> bool {
         if self.image_mut(observation.image).points[observation.keypoint.index()].is_some() {
+            return false;
+        }
+        if self.apart_from_track(observation.image, id) {
             return false;
         }
         let track = &mut self.point_mut(id).track;
@@ -218,6 +223,12 @@ impl Reconstruction {
         track.insert(at, observation);
         self.image_mut(observation.image).points[observation.keypoint.index()] = Some(id);
         true
+    }
+
+    /// Whether an image shows another place than one of those that see a point.
+    pub fn apart_from_track(&self, image: ImageId, id: Point3dId) -> bool {
+        !self.apart.is_empty()
+            && self.point(id).is_some_and(|point| self.apart.from_any(image, point.track.iter().map(|seen| seen.image)))
     }
 
     /// Removes a sighting; a point left with fewer than two goes too.
@@ -232,13 +243,16 @@ impl Reconstruction {
         }
     }
 
-    /// Joins two points into the first, at `xyz`. False, without change, when both see one image.
+    /// Joins two points into the first, at `xyz`. False, without change, when both see one image or they see images apart.
     pub fn merge_points(&mut self, into: Point3dId, from: Point3dId, xyz: Vector3<f64>) -> bool {
         let (Some(a), Some(b)) = (self.point(into), self.point(from)) else { return false };
         if into == from || a.track.iter().any(|seen| b.track.iter().any(|other| other.image == seen.image)) {
             return false;
         }
         let track = b.track.clone();
+        if track.iter().any(|seen| self.apart_from_track(seen.image, into)) {
+            return false;
+        }
         self.remove_point(from);
         for observation in track {
             self.add_observation(into, observation);
@@ -286,6 +300,7 @@ impl Reconstruction {
         let mut sightings = 0;
         for (id, point) in self.points() {
             assert!(point.track.len() >= 2, "point {id:?} has a track of {}", point.track.len());
+            assert!(!point.track.iter().any(|seen| self.apart_from_track(seen.image, id)), "{id:?} joins images apart");
             for seen in &point.track {
                 assert_eq!(self.images[&seen.image].points[seen.keypoint.index()], Some(id));
             }
@@ -313,6 +328,19 @@ mod tests {
 
     fn seen(image: u32, keypoint: u32) -> Observation {
         Observation { image: ImageId(image), keypoint: KeypointIdx(keypoint) }
+    }
+
+    #[test]
+    fn no_track_joins_images_apart() {
+        let mut model = two_images();
+        model.apart = [(ImageId(2), ImageId(0))].into_iter().collect();
+        let a = model.add_point(Vector3::new(0.0, 0.0, 1.0), vec![seen(0, 0), seen(1, 0)], [0; 3]);
+        assert!(!model.add_observation(a, seen(2, 0)));
+        let b = model.add_point(Vector3::new(0.1, 0.0, 1.0), vec![seen(1, 1), seen(2, 1)], [0; 3]);
+        assert!(!model.add_observation(b, seen(0, 1)));
+        model.remove_observation(a, seen(1, 0));
+        assert!(!model.merge_points(b, a, Vector3::zeros()));
+        model.assert_consistent();
     }
 
     #[test]

@@ -72,6 +72,7 @@ fn report(model: &Reconstruction) -> Report {
             }],
         }],
         images,
+        look_alikes: Vec::new(),
         notes: vec!["Widened to 40 % & more.".into()],
     }
 }

@@ -109,6 +109,7 @@ impl FakeEngine {
             stages: Vec::new(),
             models: if with_model { vec![model] } else { Vec::new() },
             images,
+            look_alikes: Vec::new(),
             notes: Vec::new(),
         };
         let mut files = BTreeMap::from([

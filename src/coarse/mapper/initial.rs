@@ -2,9 +2,9 @@
 
 use std::collections::BTreeSet;
 
-use super::Mapper;
+use super::{Mapper, empty_model};
 use crate::geometry::Rigid3;
-use crate::scene::{ImageId, Reconstruction};
+use crate::scene::ImageId;
 
 /// A pair with the score it is tried by.
 struct Candidate {
@@ -64,7 +64,7 @@ impl Mapper<'_> {
     }
 
     fn reset(&mut self) {
-        self.model = Reconstruction::new(self.input.cameras.clone());
+        self.model = empty_model(self.input);
         self.point_of_track.fill(None);
     }
 

@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{MatchGraph, Tracks};
 use crate::camera::{Camera, Pixel};
-use crate::scene::{CameraId, ImageId, Point3dId, Reconstruction};
+use crate::scene::{ApartImages, CameraId, ImageId, Point3dId, Reconstruction};
 
 /// What the mapper is told of an image.
 #[derive(Clone, Debug)]
@@ -42,6 +42,8 @@ pub struct MapperInput {
     pub cameras: BTreeMap<CameraId, Camera>,
     /// Verified pairs.
     pub graph: MatchGraph,
+    /// Images that show different places: no track joins them.
+    pub apart: ApartImages,
 }
 
 /// Why the mapper left an image out.
@@ -128,7 +130,7 @@ fn best_model(
     progress: &(dyn Fn(usize) + Sync),
 ) -> Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> {
     let graph = input.graph.restricted_to(component);
-    let tracks = Tracks::build(&graph);
+    let tracks = Tracks::build(&graph, &input.apart);
     let mut used_starts = BTreeSet::new();
     let mut best: Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> = None;
     for _ in 0..options.max_starts {
@@ -149,6 +151,13 @@ fn best_model(
         }
     }
     best
+}
+
+/// A model without images.
+fn empty_model(input: &MapperInput) -> Reconstruction {
+    let mut model = Reconstruction::new(input.cameras.clone());
+    model.apart = input.apart.clone();
+    model
 }
 
 /// A model that grows.
@@ -182,7 +191,7 @@ impl<'a> Mapper<'a> {
             component,
             options,
             seed,
-            model: Reconstruction::new(input.cameras.clone()),
+            model: empty_model(input),
             point_of_track: vec![None; tracks.tracks.len()],
             trials: BTreeMap::new(),
             failures: BTreeMap::new(),

@@ -34,7 +34,7 @@ fn without_exif(scene: &SyntheticScene, options: &SceneOptions, guess_px: f64) -
         }
         graph.pairs.insert((a, b), geometry);
     }
-    MapperInput { images, cameras: [(CameraId(0), camera)].into(), graph }
+    MapperInput { images, cameras: [(CameraId(0), camera)].into(), graph, apart: Default::default() }
 }
 
 /// The focal lengths of the cameras in use, of the images with even and of those with odd numbers.
