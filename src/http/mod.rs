@@ -10,6 +10,7 @@ mod routes;
 mod server;
 mod thumbnail;
 mod tus;
+mod unread;
 mod upload;
 mod wire;
 

@@ -19,6 +19,7 @@ use uuid::Uuid;
 
 use super::AppState;
 use super::problem::{Code, Problem};
+use super::unread::Unread;
 use crate::config::UploadLimits;
 use crate::store::{ArchiveError, Committed, ImagePath, InvalidFileName, StagedFile, StagedWriter, Store, unpack};
 
@@ -75,6 +76,7 @@ struct Intake {
 pub(super) struct Parts {
     multipart: Multipart,
     between: Between,
+    unread: Unread,
 }
 
 /// Bytes the reader took since it began to look for a part; none while it reads one.
@@ -86,7 +88,10 @@ impl Parts {
     pub(super) async fn of(request: Request) -> Result<Self, Problem> {
         let between = Between::default();
         let counted = Arc::clone(&between);
-        let request = request.map(|body| {
+        let (request, body) = request.into_parts();
+        let (body, unread) = Unread::split(body);
+        let request = Request::from_parts(
+            request,
             Body::from_stream(body.into_data_stream().map(move |chunk| {
                 let chunk = chunk?;
                 let mut taken = counted.lock().unwrap_or_else(PoisonError::into_inner);
@@ -97,12 +102,12 @@ impl Parts {
                     }
                 }
                 Ok(chunk)
-            }))
-        });
+            })),
+        );
         let multipart = Multipart::from_request(request, &())
             .await
             .map_err(|error| Problem::new(Code::InvalidMultipart).detail(error.body_text()))?;
-        Ok(Self { multipart, between })
+        Ok(Self { multipart, between, unread })
     }
 
     async fn next(&mut self, idle: Duration) -> Result<Option<Field<'_>>, Problem> {
@@ -116,6 +121,20 @@ impl Parts {
 
 /// Stores every photograph of a request in a dataset; the text parts are taken where `with_text` says so.
 pub(super) async fn receive(
+    state: &AppState,
+    parts: Parts,
+    dataset: Uuid,
+    with_text: bool,
+) -> Result<Received, Problem> {
+    let unread = parts.unread.clone();
+    let received = receive_parts(state, parts, dataset, with_text).await;
+    if received.is_err() {
+        unread.drop_rest().await;
+    }
+    received
+}
+
+async fn receive_parts(
     state: &AppState,
     mut parts: Parts,
     dataset: Uuid,
