@@ -183,7 +183,7 @@ fn look_alike_note(account: &LookAlikeAccount, intake: &Intake) -> Option<String
          alike. They were left out: {}{}.",
         account.cut.len(),
         named.join(", "),
-        if account.cut.len() > NAMED_PAIRS { ", ..." } else { "" }
+        if account.cut.len() > NAMED_PAIRS { " and others" } else { "" }
     ))
 }
 
