@@ -1,7 +1,6 @@
 //! What may be done with jobs from outside: enqueue, cancel, resume, delete. Every move is one transaction, and each change of
 //! state is an event.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use sqlx::SqliteConnection;
@@ -254,9 +253,7 @@ impl Jobs {
         }
         tx.commit().await?;
         self.hub.announce();
-        let folders = own.map(|dataset| self.store.data.dataset(dataset)).into_iter();
-        self.discard(folders.chain([self.store.data.job(id)]).collect()).await;
-        Ok(())
+        Ok(self.store.discard_deleted().await?)
     }
 
     /// Deletes a dataset that no job refers to.
@@ -272,22 +269,6 @@ impl Jobs {
             return Err(JobsError::DatasetNotFound);
         }
         tx.commit().await?;
-        self.discard(vec![self.store.data.dataset(id)]).await;
-        Ok(())
-    }
-
-    /// Removes folders whose rows are gone. Failing that costs space, no more: it is told to the log.
-    async fn discard(&self, folders: Vec<PathBuf>) {
-        let store = Arc::clone(&self.store);
-        let removal = tokio::task::spawn_blocking(move || {
-            for folder in folders {
-                if let Err(error) = store.data.discard(&folder) {
-                    tracing::warn!(folder = %folder.display(), %error, "a deleted folder could not be removed");
-                }
-            }
-        });
-        if let Err(error) = removal.await {
-            tracing::error!(%error, "removing folders panicked");
-        }
+        Ok(self.store.discard_deleted().await?)
     }
 }

@@ -53,16 +53,12 @@ pub async fn recover(store: &Store) -> Result<Recovered, StoreError> {
             transition(&mut tx, &mut row, JobState::Queued, None).await?;
         }
     }
-    let mut folders = Vec::new();
     for dataset in datasets::abandoned(&mut *tx).await? {
         let Ok(dataset) = dataset.parse::<Uuid>() else { continue };
         recovered.abandoned_uploads += 1;
         datasets::delete(&mut tx, dataset).await?;
-        folders.push(store.data.dataset(dataset));
     }
     tx.commit().await?;
-    for folder in folders {
-        store.data.discard(&folder)?;
-    }
+    store.discard_deleted().await?;
     Ok(recovered)
 }

@@ -16,17 +16,18 @@
 use std::fs::{File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use uuid::Uuid;
 
 use super::atomic;
 
-/// A data directory, locked for this process.
-#[derive(Debug)]
+/// A data directory, locked for this process until the last copy is dropped.
+#[derive(Clone, Debug)]
 pub struct DataDir {
     root: PathBuf,
     /// Held for its lock alone.
-    _lock: File,
+    _lock: Arc<File>,
 }
 
 impl DataDir {
@@ -53,7 +54,7 @@ impl DataDir {
             atomic::empty_dir(&root.join(folder))?;
         }
         atomic::sync_dir(&root)?;
-        Ok(Self { root, _lock: lock })
+        Ok(Self { root, _lock: Arc::new(lock) })
     }
 
     /// The directory itself.

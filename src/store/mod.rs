@@ -77,6 +77,28 @@ impl Store {
         Ok(Self { db, data })
     }
 
+    /// Removes the folders of deleted jobs and datasets. What can't be removed stays on the list for the next time and is told to
+    /// the log: it costs space, no more.
+    ///
+    /// # Errors
+    /// What SQLite said.
+    pub async fn discard_deleted(&self) -> Result<(), StoreError> {
+        for folder in db::discards::list(self.db.reader()).await? {
+            let data = self.data.clone();
+            let place = data.root().join(&folder);
+            let removal = tokio::task::spawn_blocking(move || data.discard(&place)).await;
+            match removal.map_err(io::Error::other).and_then(|removed| removed) {
+                Ok(()) => {
+                    let mut tx = self.db.write().await?;
+                    db::discards::remove(&mut tx, &folder).await?;
+                    tx.commit().await?;
+                }
+                Err(error) => tracing::warn!(folder, %error, "a deleted folder could not be removed"),
+            }
+        }
+        Ok(())
+    }
+
     /// Bytes that work may still fill: a reserve for deleting and for the database is kept back, and what open uploads have
     /// announced counts as taken.
     ///

@@ -6,6 +6,7 @@
 
 pub mod dataset_images;
 pub mod datasets;
+pub mod discards;
 pub mod job_events;
 pub mod job_images;
 pub mod job_outputs;
