@@ -2,13 +2,13 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod program;
 mod service;
 
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use program::Program;
 use serde_json::{Value, json};
 use service::{FakeEngine, Service, file, files_below, photographs};
 
@@ -116,33 +116,7 @@ async fn a_data_directory_serves_one_process_at_a_time() {
     service.post_form("/api/v1/jobs", form).await.ok(202);
 }
 
-/// The real program.
-struct Program {
-    child: Child,
-    base: String,
-}
-
 impl Program {
-    fn start(data_dir: &Path) -> Self {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_multistage"))
-            .args(["serve", "--bind", "127.0.0.1:0", "--threads", "2", "--data-dir"])
-            .arg(data_dir)
-            .env("RUST_LOG", "warn")
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let base = line.trim().strip_prefix("listening on ").unwrap_or_else(|| panic!("{line:?}"));
-        Self { base: base.trim_end_matches('/').to_owned(), child }
-    }
-
-    /// As `kill -9`: no time for anything.
-    fn kill(mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
-    }
-
     async fn get(&self, path: &str) -> Value {
         let text = reqwest::get(format!("{}{path}", self.base)).await.unwrap().text().await.unwrap();
         serde_json::from_str(&text).unwrap_or_else(|error| panic!("{path}: {error}: {text}"))
@@ -169,14 +143,6 @@ impl Program {
         let files =
             files.map(|file| (file["path"].as_str().unwrap().to_owned(), file["etag"].as_str().unwrap().to_owned()));
         files.filter(|(path, _)| !path.starts_with("report.")).collect()
-    }
-}
-
-impl Drop for Program {
-    fn drop(&mut self) {
-        // Already gone after `kill`.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 

@@ -6,14 +6,15 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod program;
+
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
+use program::Program;
 use reqwest::{Response, StatusCode};
 use serde_json::{Value, json};
 use sha2::Digest;
@@ -32,42 +33,13 @@ const TARGETS: [&str; 8] =
     ["outputs", "delete", "export", "add_points", "refine", "coarse_match", "add_cameras", "coarse_model"];
 const WITHIN: Duration = Duration::from_millis(40);
 
-struct Program {
-    child: Child,
-    base: String,
-}
-
-impl Program {
-    async fn start(data_dir: &Path) -> Self {
-        let start = Instant::now();
-        let mut child = Command::new(env!("CARGO_BIN_EXE_multistage"))
-            .args(["serve", "--bind", "127.0.0.1:0", "--threads", "2", "--data-dir"])
-            .arg(data_dir)
-            .env("RUST_LOG", "error")
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let base = line.trim().strip_prefix("listening on ").unwrap_or_else(|| panic!("{line:?}"));
-        let program = Self { base: base.trim_end_matches('/').to_owned(), child };
-        let ready = reqwest::get(format!("{}/readyz", program.base)).await.unwrap();
-        assert!(ready.status().is_success() && start.elapsed() < READY, "not ready after {:?}", start.elapsed());
-        program
-    }
-
-    fn kill(mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
-    }
-}
-
-impl Drop for Program {
-    fn drop(&mut self) {
-        // Already gone after `kill`.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// Starts the program, which must be ready in time.
+async fn start(data_dir: &Path) -> Program {
+    let start = Instant::now();
+    let program = Program::start(data_dir);
+    let ready = reqwest::get(format!("{}/readyz", program.base)).await.unwrap();
+    assert!(ready.status().is_success() && start.elapsed() < READY, "not ready after {:?}", start.elapsed());
+    program
 }
 
 /// What the client was told, and what it therefore counts on.
@@ -297,7 +269,7 @@ async fn nothing_acknowledged_is_lost_however_often_the_program_is_killed() {
     };
     let kills: usize = std::env::var("MULTISTAGE_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(KILLS);
     let undisturbed = tempfile::tempdir().unwrap();
-    let program = Program::start(undisturbed.path()).await;
+    let program = start(undisturbed.path()).await;
     let mut client = Client::new(&photographs);
     client.go_on(&program.base).await.unwrap();
     let expected = client.outputs.clone().unwrap();
@@ -312,7 +284,7 @@ async fn nothing_acknowledged_is_lost_however_often_the_program_is_killed() {
         let mut client = Client::new(&photographs);
         let mut stretch = 1.0;
         loop {
-            let program = Program::start(folder.path()).await;
+            let program = start(folder.path()).await;
             // Most moments are drawn from short lives: requests take milliseconds, stages seconds.
             let life = LIFE[0] + (LIFE[1] - LIFE[0]).mul_f64(random.unit().powi(2) * stretch);
             let (base, mut phase) = (program.base.clone(), client.phase.subscribe());
@@ -349,7 +321,7 @@ async fn nothing_acknowledged_is_lost_however_often_the_program_is_killed() {
         integrity(folder.path()).await;
     }
     // What is left: no job, no file of one, no half upload; datasets that were made for themselves stay.
-    let program = Program::start(folder.path()).await;
+    let program = start(folder.path()).await;
     assert_eq!(get(&program.base, "/api/v1/jobs").await.unwrap()["jobs"], json!([]));
     for gone in ["jobs", "uploads", "incoming", "trash"] {
         assert_eq!(std::fs::read_dir(folder.path().join(gone)).unwrap().count(), 0, "{gone}");

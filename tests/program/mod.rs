@@ -1,0 +1,43 @@
+//! The real program on a data directory of its own, to be killed.
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+/// The running program; it ends with this value at the latest.
+pub struct Program {
+    child: Child,
+    /// Its address, without a slash at the end.
+    pub base: String,
+}
+
+impl Program {
+    /// Starts it and waits until it listens.
+    pub fn start(data_dir: &Path) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_multistage"))
+            .args(["serve", "--bind", "127.0.0.1:0", "--threads", "2", "--data-dir"])
+            .arg(data_dir)
+            .env("RUST_LOG", "error")
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let base = line.trim().strip_prefix("listening on ").unwrap_or_else(|| panic!("{line:?}"));
+        Self { base: base.trim_end_matches('/').to_owned(), child }
+    }
+
+    /// As `kill -9`: no time for anything.
+    pub fn kill(mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // Already gone after `kill`.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
