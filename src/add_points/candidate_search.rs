@@ -1,6 +1,7 @@
 //! The features within a band around a line (paper, section 6.2.1): four ways, one result.
 //!
-//! - *strips*: what the band covers of strips across the line ([`super::strips`]), exact without sampling;
+//! - *sweep*: features in the order in which a line about the epipole meets them ([`super::sweep`]), exact without sampling
+//!   and without a search for each line; made for a pair of images, so it is not among the finders of this file;
 //! - *grid*: four overlapping grids ([`super::grid`]), `O(K + C')` for K samples and C' features in their cells;
 //! - *radial*: a k-d tree over positions, asked for the neighbourhood of every sample. Discs of the print's radius d at a
 //!   spacing of d miss 4 % of the band (half-way between samples they reach only 0.866 d); of radius `sqrt(5)/2 d` nothing;
@@ -14,15 +15,14 @@ use serde::{Deserialize, Serialize};
 
 use super::epipolar::{BoundingBox, EpipolarLine};
 use super::grid::OverlappingGrids;
-use super::strips::Strips;
 
 /// How features near an epipolar line are found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CandidateSearch {
-    /// Strips across the line: the fastest.
+    /// A sweep about the epipole: the fastest.
     #[default]
-    Strips,
+    Sweep,
     /// Overlapping grids: the paper's choice.
     Grid,
     /// A k-d tree over positions.
@@ -41,7 +41,6 @@ pub struct CandidateFinder {
 }
 
 enum Index {
-    Strips(Strips),
     Grid(OverlappingGrids),
     Radial(Box<ImmutableKdTree<f64, 2>>),
     Linear,
@@ -91,9 +90,6 @@ impl CandidateFinder {
     ) -> Self {
         let bounds = BoundingBox::around(members.iter().map(|&member| &positions[member as usize]));
         let index = match (search, bounds) {
-            (CandidateSearch::Strips, Some(bounds)) => {
-                Index::Strips(Strips::new(&positions, &members, bounds, band_px))
-            }
             (CandidateSearch::Grid, Some(bounds)) => {
                 Index::Grid(OverlappingGrids::new(&positions, &members, bounds, cell_half_size_px))
             }
@@ -128,10 +124,6 @@ impl CandidateFinder {
         marks.restart(self.positions.len());
         let within = |feature: u32| line.distance_px(&self.positions[feature as usize]) <= self.band_px;
         match &self.index {
-            Index::Strips(strips) => strips.visit(line, self.band_px, |feature| {
-                marks.mark(feature);
-                found.push(feature);
-            }),
             Index::Grid(grids) => grids.visit(line, self.band_px, |feature| {
                 if within(feature) && marks.mark(feature) {
                     found.push(feature);
@@ -235,19 +227,13 @@ mod tests {
     }
 
     #[test]
-    fn strips_find_all() {
-        assert_eq!(recall(CandidateSearch::Strips, 2.25), 1.0);
-    }
-
-    #[test]
     fn radial_search_finds_all() {
         assert_eq!(recall(CandidateSearch::Radial, 2.25), 1.0);
     }
 
     #[test]
     fn no_features_are_no_candidates() {
-        for search in [CandidateSearch::Strips, CandidateSearch::Grid, CandidateSearch::Radial, CandidateSearch::Linear]
-        {
+        for search in [CandidateSearch::Grid, CandidateSearch::Radial, CandidateSearch::Linear] {
             let finder = CandidateFinder::new(Vec::new(), Vec::new(), 4.0, 9.0, search);
             let mut found = vec![1];
             finder.near_line(&random_line(&mut Rng::from_parts(&[1])), &mut SeenMarks::default(), &mut found);

@@ -1,8 +1,8 @@
 //! Matching two images with known poses along epipolar lines (paper, sections 6.2.1 to 6.2.3).
 //!
-//! For every group of queries that share an epipolar line the candidates near the line are gathered once, and each query is
-//! compared with all of them: with about 80 candidates a packed scan of exact distances costs less than the building of
-//! the paper's small k-d trees alone (the authors' program spends a quarter of its time on that).
+//! Each query is compared with all candidates near its epipolar line ([`super::one_way`]): with about 80 candidates a packed
+//! scan of exact distances costs less than the building of the paper's small k-d trees alone (the authors' program spends a
+//! quarter of its time on that).
 //!
 //! The ratio test comes *after* the geometric restriction: look-alikes elsewhere on a facade are not among the candidates,
 //! so they can't reject a match, which is where the method's density comes from. A small candidate set would make the
@@ -16,14 +16,12 @@ use std::f64::consts::{PI, TAU};
 
 use serde::{Deserialize, Serialize};
 
-use super::candidate_search::SeenMarks;
 use super::epipolar::EpipolarGeometry;
-use super::line_groups::group_by_line;
+use super::one_way::{Found, OneWay};
 use super::options::GuidedMatchOptions;
 use super::prepared::PreparedImage;
-use crate::matching::descriptor::{PackedDescriptors, Top2, distance_sq, top2};
 use crate::math::Rng;
-use crate::scene::{Descriptor, ImageId, KeypointIdx};
+use crate::scene::{ImageId, KeypointIdx};
 
 /// Keypoints of the two images of a pair that belong together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -92,126 +90,6 @@ pub fn guided_match(
         distinctive: found.distinctive,
     };
     matches.into_iter().map(keypoints).collect()
-}
-
-/// A query's match.
-#[derive(Clone, Copy, Debug)]
-struct Found {
-    query: u32,
-    target: u32,
-    distance_sq: u32,
-    distinctive: bool,
-}
-
-/// The search for one image's queries in another.
-struct OneWay<'a> {
-    query: &'a PreparedImage,
-    target: &'a PreparedImage,
-    geometry: &'a EpipolarGeometry,
-    options: &'a GuidedMatchOptions,
-    check_ratio: bool,
-}
-
-impl OneWay<'_> {
-    /// The matches of these queries, by query.
-    fn run(&self, queries: impl Iterator<Item = u32>, mut rng: Rng) -> Vec<Found> {
-        let Some(bounds) = self.target.finder.bounds() else { return Vec::new() };
-        let band_px = self.options.band_px * self.target.px_scale;
-        let tolerance_px = self.options.group_tolerance_px * self.target.px_scale;
-        let clearance_px = self.options.epipole_clearance_bands * self.options.band_px * self.query.px_scale;
-        let epipole = self.geometry.epipole_in_query();
-        let clear = queries
-            .filter(|&q| epipole.is_none_or(|e| (self.query.finder.positions()[q as usize] - e).norm() >= clearance_px))
-            .map(|q| (q, self.query.normalized[q as usize]));
-        let groups = group_by_line(self.geometry, clear, &bounds.grown(band_px), tolerance_px);
-
-        let mut pads = Padding::new(self.target.finder.members(), &mut rng);
-        let (mut marks, mut rows) = (SeenMarks::default(), Vec::new());
-        let (mut packed, mut nearest) = (PackedDescriptors::new(), Vec::new());
-        let mut descriptors: Vec<Descriptor> = Vec::new();
-        let mut found = Vec::new();
-        for group in &groups {
-            self.target.finder.near_line(&group.anchor, &mut marks, &mut rows);
-            let candidates = rows.len();
-            if candidates == 0 {
-                continue;
-            }
-            pads.fill(&mut rows, self.options.pad_to, &mut marks, &mut rng);
-            packed.repack_subset(&self.target.features.descriptors, &rows);
-            descriptors.clear();
-            descriptors.extend(group.queries.iter().map(|&q| self.query.features.descriptors[q as usize]));
-            top2(&descriptors, &packed, &mut nearest);
-            for (&query, nearest) in group.queries.iter().zip(&nearest) {
-                if nearest.index as usize >= candidates || !self.is_near(query, rows[nearest.index as usize], band_px) {
-                    continue;
-                }
-                let target = rows[nearest.index as usize];
-                let second = self.second_distance_sq(query, nearest, &rows, &marks);
-                let passes = |max_ratio: f64| {
-                    let allowed = |second: u32| max_ratio * max_ratio * f64::from(second);
-                    second.is_some_and(|second| f64::from(nearest.distance_sq) <= allowed(second))
-                };
-                if !self.check_ratio || passes(self.options.max_ratio) {
-                    let distinctive = passes(self.options.distinctive_ratio);
-                    found.push(Found { query, target, distance_sq: nearest.distance_sq, distinctive });
-                }
-            }
-        }
-        found.sort_unstable_by_key(|found| found.query);
-        found
-    }
-
-    /// The exact distance test (equation 3) against the query's own line, not only its group's.
-    fn is_near(&self, query: u32, target: u32, band_px: f64) -> bool {
-        let position = &self.target.finder.positions()[target as usize];
-        let line = self.geometry.line_in_target(&self.query.normalized[query as usize]);
-        line.is_some_and(|line| line.distance_px(position) <= band_px)
-    }
-
-    /// The squared distance to the nearest row that is not at the best one's place.
-    fn second_distance_sq(&self, query: u32, nearest: &Top2, rows: &[u32], marks: &SeenMarks) -> Option<u32> {
-        let second = nearest.second_distance_sq?;
-        let best = rows[nearest.index as usize];
-        let here = self.target.same_place.others(best);
-        let descriptor = &self.query.features.descriptors[query as usize];
-        let distance_to = |row: u32| distance_sq(descriptor, &self.target.features.descriptors[row as usize]);
-        if !here.iter().any(|&row| marks.is_marked(row) && distance_to(row) == second) {
-            return Some(second);
-        }
-        let elsewhere = rows.iter().filter(|&&row| row != best && here.binary_search(&row).is_err());
-        elsewhere.map(|&row| distance_to(row)).min()
-    }
-}
-
-/// Random features of the target to fill small candidate sets.
-struct Padding {
-    shuffled: Vec<u32>,
-}
-
-impl Padding {
-    fn new(members: &[u32], rng: &mut Rng) -> Self {
-        let mut shuffled = members.to_vec();
-        rng.shuffle(&mut shuffled);
-        Self { shuffled }
-    }
-
-    /// Appends features that are not marked until there are `wanted` rows or no more features.
-    fn fill(&mut self, rows: &mut Vec<u32>, wanted: usize, marks: &mut SeenMarks, rng: &mut Rng) {
-        if rows.len() >= wanted {
-            return;
-        }
-        let n = self.shuffled.len();
-        let start = rng.below(n);
-        for step in 0..n {
-            if rows.len() >= wanted {
-                return;
-            }
-            let feature = self.shuffled[(start + step) % n];
-            if marks.mark(feature) {
-                rows.push(feature);
-            }
-        }
-    }
 }
 
 /// Of the matches to one target the one with the nearest descriptor (ties: the first query).

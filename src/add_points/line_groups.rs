@@ -4,17 +4,14 @@
 //! dual line have nearly the same epipolar line. They are grouped: two queries share a group when their lines cut the
 //! target's border within a tolerance (2 pixels) at both ends.
 //!
-//! Epipolar lines are a pencil: all pass through the epipole, so one number orders them, their angle about it (mod pi). Sorted
-//! by it, a group ends as soon as a line's border hits are further than the tolerance from those of the group's *first* line.
+//! Epipolar lines are a pencil ([`super::pencil`]): one number orders them, their turn about the epipole. Sorted by it, a
+//! group ends as soon as a line's border hits are further than the tolerance from those of the group's *first* line.
 //! Comparing each line with the one before it instead, as the paper's appendix A.2 does, lets groups drift without bound.
-//!
-//! The angle, whether the epipole is in the image, far away or at infinity: in coordinates centred on the target's box and
-//! scaled by its size, the lines `l` through the homogeneous epipole `e` are the plane `l . e = 0`. With an orthonormal basis
-//! `u, v` of that plane, `l = a u + b v`, and `atan(b / a)` orders the pencil.
 
-use nalgebra::{Matrix3, Vector2, Vector3};
+use nalgebra::Vector2;
 
 use super::epipolar::{BoundingBox, EpipolarGeometry, EpipolarLine};
+use super::pencil::{Pencil, Turn};
 use crate::camera::Normalized;
 
 /// Queries with nearly one epipolar line.
@@ -22,14 +19,14 @@ use crate::camera::Normalized;
 pub struct LineGroup {
     /// The line of the group's first query.
     pub anchor: EpipolarLine,
-    /// The queries, by angle of their lines.
+    /// The queries, by the turns of their lines.
     pub queries: Vec<u32>,
 }
 
 /// A query's line, where it cuts the border, and its place in the pencil.
 struct QueryLine {
     query: u32,
-    angle_rad: f64,
+    turn: Turn,
     line: EpipolarLine,
     ends: [Vector2<f64>; 2],
 }
@@ -48,10 +45,10 @@ pub fn group_by_line(
             let coefficients = geometry.line_coefficients(&at);
             let line = EpipolarLine::from_coefficients(&coefficients)?;
             let ends = target_bounds.clip(&line)?;
-            Some(QueryLine { query, angle_rad: pencil.angle_rad(&coefficients), line, ends })
+            Some(QueryLine { query, turn: pencil.line(&coefficients).turn, line, ends })
         })
         .collect();
-    lines.sort_by(|a, b| a.angle_rad.total_cmp(&b.angle_rad).then(a.query.cmp(&b.query)));
+    lines.sort_unstable_by_key(|line| (line.turn, line.query));
     let mut groups: Vec<LineGroup> = Vec::new();
     let mut anchor_ends = [Vector2::repeat(f64::INFINITY); 2];
     for QueryLine { query, line, ends, .. } in lines {
@@ -73,37 +70,9 @@ fn within(a: &[Vector2<f64>; 2], b: &[Vector2<f64>; 2], tolerance_px: f64) -> bo
     near(&a[0], &b[0]) && near(&a[1], &b[1]) || near(&a[0], &b[1]) && near(&a[1], &b[0])
 }
 
-/// The lines through an epipole, ordered by angle.
-struct Pencil {
-    /// Takes line coefficients to centred, scaled coordinates.
-    lines_to_scaled: Matrix3<f64>,
-    u: Vector3<f64>,
-    v: Vector3<f64>,
-}
-
-impl Pencil {
-    fn new(epipole: &Vector3<f64>, bounds: &BoundingBox) -> Self {
-        let (center, size) = ((bounds.min + bounds.max) / 2.0, (bounds.max - bounds.min).norm().max(1.0));
-        // A position p is center + size p', so l . p = 0 reads (H^T l) . p' = 0 with H below.
-        let from_scaled = Matrix3::new(size, 0.0, center.x, 0.0, size, center.y, 0.0, 0.0, 1.0);
-        let scaled = Vector3::new(epipole.x - center.x * epipole.z, epipole.y - center.y * epipole.z, size * epipole.z)
-            .normalize();
-        let least = scaled.iamin();
-        let u = scaled.cross(&Vector3::ith(least, 1.0)).normalize();
-        Self { lines_to_scaled: from_scaled.transpose(), v: scaled.cross(&u), u }
-    }
-
-    /// In (-pi/2, pi/2], the same for a line and its negative.
-    fn angle_rad(&self, coefficients: &Vector3<f64>) -> f64 {
-        let line = self.lines_to_scaled * coefficients;
-        let (a, b) = (line.dot(&self.u), line.dot(&self.v));
-        if a == 0.0 { std::f64::consts::FRAC_PI_2 } else { (b / a).atan() }
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use nalgebra::UnitQuaternion;
+    use nalgebra::{UnitQuaternion, Vector3};
 
     use super::*;
     use crate::camera::{Camera, CameraModel, FocalSource, Pixel};

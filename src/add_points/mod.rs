@@ -5,7 +5,7 @@
 //!
 //! - [`candidate_pairs`](mod@candidate_pairs) (6.1): images that share points are worth matching;
 //! - [`epipolar`] (6.2, equations 1 to 3): where the counterpart of a feature must lie;
-//! - [`candidate_search`], by [`grid`] (6.2.1, equations 4 to 9) or [`strips`]: the features near that line, fast;
+//! - [`candidate_search`], by [`grid`] (6.2.1, equations 4 to 9) or [`sweep`]: the features near that line, fast;
 //! - [`line_groups`] (6.2.2): features that share a line share the search;
 //! - [`guided_match`](mod@guided_match) (6.2.2, 6.2.3): best descriptor along the line, ratio test after the geometry;
 //! - [`triangulate`] (6.3): each image's matches as tracks, and their points;
@@ -22,9 +22,11 @@ pub mod grid;
 pub mod guided_match;
 pub mod line_groups;
 pub mod merge;
+pub mod one_way;
 mod options;
+pub mod pencil;
 pub mod prepared;
-pub mod strips;
+pub mod sweep;
 #[cfg(test)]
 mod test_scene;
 #[cfg(test)]

@@ -73,7 +73,8 @@ impl CandidatePairOptions {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct GuidedMatchOptions {
-    /// How features near an epipolar line are found; all give the same matches.
+    /// How features near an epipolar line are found. Grid, radial and linear search give the same matches; the sweep has no
+    /// groups of lines, so its candidates are those of each query's own band, without the group's tolerance.
     pub search: CandidateSearch,
     /// Half-width of the band around an epipolar line, the paper's d: scaled pixels. Wider bands forgive worse poses and
     /// compare more features. The authors' code has 4.
@@ -116,7 +117,7 @@ pub struct GuidedMatchOptions {
 impl Default for GuidedMatchOptions {
     fn default() -> Self {
         Self {
-            search: CandidateSearch::Strips,
+            search: CandidateSearch::Sweep,
             band_px: 4.0,
             group_tolerance_px: 2.0,
             cell_half_size_bands: 2.25,

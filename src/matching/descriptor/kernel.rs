@@ -16,7 +16,7 @@ use crate::scene::{DESCRIPTOR_LEN, Descriptor};
 const CHUNK_GROUPS: usize = 64;
 
 /// Any distance at or above this belongs to padding.
-const PADDING_LIMIT: i32 = PADDING_BIAS / 2;
+pub(super) const PADDING_LIMIT: i32 = PADDING_BIAS / 2;
 
 /// Sixteen 32-bit lanes and the dot products of queries with groups of rows.
 ///
@@ -46,6 +46,20 @@ pub(super) unsafe trait Kernel {
     unsafe fn max(a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
     /// In every lane `a < b ? if_less : otherwise`.
     unsafe fn select_less(a: Self::Lanes, b: Self::Lanes, if_less: Self::Lanes, otherwise: Self::Lanes) -> Self::Lanes;
+    /// In every lane 1 where `|line[0] x + line[1] y + line[2]| <= half_width`, added up from the left, else 0.
+    unsafe fn near(line: &[f32; 3], half_width: f32, x: &[f32; GROUP_ROWS], y: &[f32; GROUP_ROWS]) -> Self::Lanes;
+}
+
+/// A block of up to Q queries in the form the multiplications need, with their squared lengths. A query that only fills up
+/// the block is farther from every row than any real one.
+#[inline(always)]
+pub(super) fn block<'a, K: Kernel, const Q: usize>(
+    used: usize,
+    query: impl Fn(usize) -> &'a Descriptor,
+) -> ([K::Query; Q], [i32; Q]) {
+    const EMPTY: Descriptor = [0; DESCRIPTOR_LEN];
+    let prepared = std::array::from_fn(|q| K::prepare(if q < used { query(q) } else { &EMPTY }));
+    (prepared, std::array::from_fn(|q| if q < used { norm_sq(query(q)) } else { PADDING_BIAS }))
 }
 
 /// Best and second-best squared distance and the best query of every row seen so far.
@@ -108,17 +122,13 @@ unsafe fn scan<K: Kernel, const Q: usize, const G: usize>(
     out: &mut Vec<Top2>,
     mut rows: Option<&mut RowStates>,
 ) {
-    const EMPTY: Descriptor = [0; DESCRIPTOR_LEN];
     out.clear();
     let num_groups = packed.num_groups();
     for chunk in (0..num_groups).step_by(CHUNK_GROUPS) {
         let chunk_end = (chunk + CHUNK_GROUPS).min(num_groups);
         for first in (0..queries.len()).step_by(Q) {
             let used = (queries.len() - first).min(Q);
-            let prepared = std::array::from_fn(|q| K::prepare(if q < used { &queries[first + q] } else { &EMPTY }));
-            // A query that only fills up the tile is farther from every row than any real one.
-            let norms_sq: [i32; Q] =
-                std::array::from_fn(|q| if q < used { norm_sq(&queries[first + q]) } else { PADDING_BIAS });
+            let (prepared, norms_sq) = block::<K, Q>(used, |q| &queries[first + q]);
             // SAFETY: passed on to the caller.
             let found = unsafe {
                 scan_block::<K, Q, G>(&prepared, &norms_sq, first, packed, chunk..chunk_end, rows.as_deref_mut())
@@ -133,12 +143,28 @@ unsafe fn scan<K: Kernel, const Q: usize, const G: usize>(
     }
 }
 
-/// Vectors that run along a chunk for one query.
+/// Vectors that run along rows for one query.
 #[derive(Clone, Copy)]
-struct Running<L> {
-    best: L,
-    second: L,
-    group: L,
+pub(super) struct Running<L> {
+    pub(super) best: L,
+    pub(super) second: L,
+    pub(super) group: L,
+}
+
+impl<L: Copy> Running<L> {
+    /// Takes a group's distances in.
+    ///
+    /// # Safety
+    /// The machine must have the instructions of `K`.
+    #[inline(always)]
+    pub(super) unsafe fn update<K: Kernel<Lanes = L>>(&mut self, distance: L, group: L) {
+        // SAFETY: passed on to the caller.
+        unsafe {
+            self.group = K::select_less(distance, self.best, group, self.group);
+            self.second = K::min(self.second, K::max(self.best, distance));
+            self.best = K::min(self.best, distance);
+        }
+    }
 }
 
 #[inline(always)]
@@ -194,10 +220,7 @@ unsafe fn update<K: Kernel, const Q: usize>(
         let mut distances = [biases; Q];
         for q in 0..Q {
             let distance = K::add(K::minus_twice(biases, dots[q]), K::splat(norms_sq[q]));
-            let state = &mut running[q];
-            state.group = K::select_less(distance, state.best, group_number, state.group);
-            state.second = K::min(state.second, K::max(state.best, distance));
-            state.best = K::min(state.best, distance);
+            running[q].update::<K>(distance, group_number);
             distances[q] = distance;
         }
         let Some(rows) = rows else { return };
@@ -217,7 +240,7 @@ unsafe fn update<K: Kernel, const Q: usize>(
 
 /// The best and second best over the sixteen lanes.
 #[inline(always)]
-unsafe fn reduce<K: Kernel>(running: &Running<K::Lanes>) -> Top2 {
+pub(super) unsafe fn reduce<K: Kernel>(running: &Running<K::Lanes>) -> Top2 {
     let (mut best, mut second, mut group) = ([0; GROUP_ROWS], [0; GROUP_ROWS], [0; GROUP_ROWS]);
     // SAFETY: the caller vouches for the instructions of `K`.
     unsafe {

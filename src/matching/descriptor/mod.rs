@@ -21,6 +21,7 @@
 //! cycle does at most one pair a cycle. One core of a Zen 5 does 3.0 Gpair/s with AVX-512 VNNI (2.8 both ways), about three
 //! quarters of that, and 1.5 with AVX-VNNI (`cargo bench --bench matching`).
 
+mod banded;
 mod kernel;
 #[cfg(target_arch = "aarch64")]
 mod neon;
@@ -32,6 +33,7 @@ mod tier;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
+pub use banded::{BandQuery, BandTop2, BandedRows, nearest_off_bands, top2_in_bands};
 pub use packed::PackedDescriptors;
 pub use tier::Tier;
 

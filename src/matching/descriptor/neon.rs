@@ -100,4 +100,18 @@ unsafe impl Kernel for Neon {
         // SAFETY: baseline instructions.
         unsafe { std::array::from_fn(|part| vbslq_s32(vcltq_s32(a[part], b[part]), if_less[part], otherwise[part])) }
     }
+
+    #[inline(always)]
+    unsafe fn near(line: &[f32; 3], half_width: f32, x: &[f32; GROUP_ROWS], y: &[f32; GROUP_ROWS]) -> Self::Lanes {
+        // SAFETY: four times 16 bytes are there.
+        unsafe {
+            std::array::from_fn(|part| {
+                let (x, y) = (vld1q_f32(x.as_ptr().add(4 * part)), vld1q_f32(y.as_ptr().add(4 * part)));
+                let signed = vaddq_f32(vmulq_n_f32(x, line[0]), vmulq_n_f32(y, line[1]));
+                let distance = vabsq_f32(vaddq_f32(signed, vdupq_n_f32(line[2])));
+                let near = vcleq_f32(distance, vdupq_n_f32(half_width));
+                vreinterpretq_s32_u32(vandq_u32(near, vdupq_n_u32(1)))
+            })
+        }
+    }
 }

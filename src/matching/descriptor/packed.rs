@@ -65,6 +65,14 @@ impl PackedDescriptors {
         self.fill(indices.len(), |row| &descriptors[indices[row] as usize]);
     }
 
+    /// Appends rows as [`PackedDescriptors::repack_subset`] packs them, starting with a new group.
+    ///
+    /// # Panics
+    /// When an index is out of range.
+    pub(super) fn append_subset(&mut self, descriptors: &[Descriptor], indices: &[u32]) {
+        self.append(indices.len(), |row| &descriptors[indices[row] as usize]);
+    }
+
     /// Number of rows.
     pub fn len(&self) -> usize {
         self.len
@@ -81,10 +89,15 @@ impl PackedDescriptors {
     }
 
     fn fill<'a>(&mut self, len: usize, descriptor: impl Fn(usize) -> &'a Descriptor) {
-        const EMPTY: Descriptor = [0; DESCRIPTOR_LEN];
-        self.len = len;
+        self.len = 0;
         self.lines.clear();
         self.biases.clear();
+        self.append(len, descriptor);
+    }
+
+    fn append<'a>(&mut self, len: usize, descriptor: impl Fn(usize) -> &'a Descriptor) {
+        const EMPTY: Descriptor = [0; DESCRIPTOR_LEN];
+        self.len += len;
         for first in (0..len).step_by(GROUP_ROWS) {
             let rows: [&Descriptor; GROUP_ROWS] =
                 std::array::from_fn(|lane| if first + lane < len { descriptor(first + lane) } else { &EMPTY });

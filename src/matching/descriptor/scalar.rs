@@ -78,4 +78,10 @@ unsafe impl Kernel for Scalar {
     unsafe fn select_less(a: Self::Lanes, b: Self::Lanes, if_less: Self::Lanes, otherwise: Self::Lanes) -> Self::Lanes {
         std::array::from_fn(|lane| if a[lane] < b[lane] { if_less[lane] } else { otherwise[lane] })
     }
+
+    #[inline(always)]
+    unsafe fn near(line: &[f32; 3], half_width: f32, x: &[f32; GROUP_ROWS], y: &[f32; GROUP_ROWS]) -> Self::Lanes {
+        let signed = |lane: usize| line[0] * x[lane] + line[1] * y[lane] + line[2];
+        std::array::from_fn(|lane| i32::from(signed(lane).abs() <= half_width))
+    }
 }

@@ -80,3 +80,72 @@ fn a_subset_is_numbered_by_its_list_and_memory_is_reused() {
         assert_eq!(out, brute_force(&queries, &chosen));
     }
 }
+
+/// Rows in a few sections, queries with random lines, and windows that hold more than their bands: every tier finds what the
+/// definition says.
+#[test]
+fn every_tier_agrees_on_bands() {
+    let mut rng = Rng::from_parts(&[4]);
+    for (num_queries, sections) in
+        [(1, vec![3]), (9, vec![40, 5, 33]), (30, vec![100, 0, 17]), (0, vec![5]), (3, vec![])]
+    {
+        let num_rows = sections.iter().sum();
+        let (queries, descriptors) = (descriptors(&mut rng, num_queries), descriptors(&mut rng, num_rows));
+        let positions: Vec<[f32; 2]> = (0..num_rows).map(|_| [(); 2].map(|()| rng.range(-50.0, 50.0) as f32)).collect();
+        let (mut rows, mut slots, mut next) = (BandedRows::default(), Vec::new(), 0u32);
+        for section in sections {
+            let indices: Vec<u32> = (next..next + section as u32).collect();
+            slots.extend((0u32..).take(section).map(|k| rows.slots() as u32 + k));
+            rows.append(&descriptors, &indices, |index| positions[index as usize]);
+            next += section as u32;
+        }
+        let bands: Vec<BandQuery> = queries
+            .iter()
+            .map(|descriptor| {
+                let angle = rng.range(0.0, 3.0);
+                let line = [angle.cos() as f32, angle.sin() as f32, rng.range(-20.0, 20.0) as f32];
+                BandQuery { descriptor, line, half_width: rng.range(0.0, 30.0) as f32 }
+            })
+            .collect();
+        let groups = BandedRows::groups_of(0..rows.slots());
+        // The whole, cut in two somewhere, so that the windows of a block overlap.
+        let windows: Vec<std::ops::Range<u32>> = bands
+            .iter()
+            .flat_map(|_| {
+                let cut = rng.below(groups.end as usize + 1) as u32;
+                [0..cut, cut..groups.end]
+            })
+            .collect();
+        let ranks: Vec<u32> = bands.iter().map(|_| rng.below(rows.slots() + 2) as u32).collect();
+        let expected: Vec<BandTop2> = bands
+            .iter()
+            .map(|band| {
+                let near = (0..num_rows).filter(|&r| band.contains(positions[r][0], positions[r][1]));
+                let mut ranked: Vec<(u32, u32)> =
+                    near.map(|r| (distance_sq(band.descriptor, &descriptors[r]), slots[r])).collect();
+                ranked.sort_unstable();
+                BandTop2 {
+                    nearest: ranked.first().map(|&(distance, slot)| (slot, distance)),
+                    second_distance_sq: ranked.get(1).map(|second| second.0),
+                    candidates: ranked.len() as u32,
+                }
+            })
+            .collect();
+        let expected_off: Vec<Option<u32>> = bands
+            .iter()
+            .zip(&ranks)
+            .map(|(band, &rank)| {
+                let off =
+                    (0..num_rows).filter(|&r| !band.contains(positions[r][0], positions[r][1]) && slots[r] < rank);
+                off.map(|r| distance_sq(band.descriptor, &descriptors[r])).min()
+            })
+            .collect();
+        for &tier in Tier::ALL.iter().filter(|tier| tier.is_available()) {
+            let (mut found, mut off) = (Vec::new(), Vec::new());
+            tier.top2_in_bands(&bands, &windows, &rows, &mut found);
+            assert_eq!(found, expected, "{tier:?} {num_queries} {num_rows}");
+            tier.nearest_off_bands(&bands, &ranks, &rows, &mut off);
+            assert_eq!(off, expected_off, "{tier:?} {num_queries} {num_rows}");
+        }
+    }
+}

@@ -1,7 +1,9 @@
 //! Which instructions to use, asked of the machine once.
 
+use std::ops::Range;
 use std::sync::LazyLock;
 
+use super::banded::{self, BandQuery, BandTop2, BandedRows};
 use super::scalar::Scalar;
 use super::{PackedDescriptors, Top2, kernel};
 use crate::scene::Descriptor;
@@ -115,6 +117,62 @@ impl Tier {
         }
     }
 
+    /// [`super::top2_in_bands`] with these instructions.
+    ///
+    /// # Panics
+    /// When the machine lacks them.
+    pub fn top2_in_bands(
+        self,
+        queries: &[BandQuery<'_>],
+        windows: &[Range<u32>],
+        rows: &BandedRows,
+        out: &mut Vec<BandTop2>,
+    ) {
+        self.assert_available();
+        // SAFETY: the instructions are there.
+        unsafe {
+            match self {
+                Self::Scalar => banded::scan::<Scalar, 4>(queries, windows, rows, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx2 => x86::in_bands_avx2(queries, windows, rows, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::AvxVnni => x86::in_bands_avx_vnni(queries, windows, rows, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Vnni => x86::in_bands_avx512_vnni(queries, windows, rows, out),
+                #[cfg(target_arch = "aarch64")]
+                Self::Neon => banded::scan::<super::neon::Neon, 6>(queries, windows, rows, out),
+            }
+        }
+    }
+
+    /// [`super::nearest_off_bands`] with these instructions.
+    ///
+    /// # Panics
+    /// When the machine lacks them.
+    pub fn nearest_off_bands(
+        self,
+        queries: &[BandQuery<'_>],
+        ranks: &[u32],
+        rows: &BandedRows,
+        out: &mut Vec<Option<u32>>,
+    ) {
+        self.assert_available();
+        // SAFETY: the instructions are there.
+        unsafe {
+            match self {
+                Self::Scalar => banded::scan_off::<Scalar, 4>(queries, ranks, rows, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx2 => x86::off_bands_avx2(queries, ranks, rows, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::AvxVnni => x86::off_bands_avx_vnni(queries, ranks, rows, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Vnni => x86::off_bands_avx512_vnni(queries, ranks, rows, out),
+                #[cfg(target_arch = "aarch64")]
+                Self::Neon => banded::scan_off::<super::neon::Neon, 6>(queries, ranks, rows, out),
+            }
+        }
+    }
+
     fn assert_available(self) {
         assert!(self <= Self::detected() || self.is_available(), "this machine has no {self:?} instructions");
     }
@@ -123,6 +181,9 @@ impl Tier {
 /// The generic scan compiled for each set of instructions, with the tile that fits its registers.
 #[cfg(target_arch = "x86_64")]
 mod x86 {
+    use std::ops::Range;
+
+    use super::super::banded::{self, BandQuery, BandTop2, BandedRows};
     use super::super::x86::{Avx2, Avx512Vnni, AvxVnni};
     use super::super::{PackedDescriptors, Top2, kernel};
     use crate::scene::Descriptor;
@@ -148,6 +209,35 @@ mod x86 {
         };
     }
 
+    macro_rules! compile_banded {
+        ($features:literal, $kernel:ty, $queries:literal, $in_bands:ident, $off_bands:ident) => {
+            #[target_feature(enable = $features)]
+            pub(super) fn $in_bands(
+                queries: &[BandQuery<'_>],
+                windows: &[Range<u32>],
+                rows: &BandedRows,
+                out: &mut Vec<BandTop2>,
+            ) {
+                // SAFETY: this function is only called on machines that have its features.
+                unsafe { banded::scan::<$kernel, $queries>(queries, windows, rows, out) }
+            }
+
+            #[target_feature(enable = $features)]
+            pub(super) fn $off_bands(
+                queries: &[BandQuery<'_>],
+                ranks: &[u32],
+                rows: &BandedRows,
+                out: &mut Vec<Option<u32>>,
+            ) {
+                // SAFETY: this function is only called on machines that have its features.
+                unsafe { banded::scan_off::<$kernel, $queries>(queries, ranks, rows, out) }
+            }
+        };
+    }
+
+    compile_banded!("avx2", Avx2, 4, in_bands_avx2, off_bands_avx2);
+    compile_banded!("avx2,avxvnni", AvxVnni, 4, in_bands_avx_vnni, off_bands_avx_vnni);
+    compile_banded!("avx512f,avx512bw,avx512vnni", Avx512Vnni, 8, in_bands_avx512_vnni, off_bands_avx512_vnni);
     compile!("avx2", Avx2, 4, 1, top2_avx2, top2_both_avx2);
     compile!("avx2,avxvnni", AvxVnni, 5, 1, top2_avx_vnni, top2_both_avx_vnni);
     compile!("avx512f,avx512bw,avx512vnni", Avx512Vnni, 6, 2, top2_avx512_vnni, top2_both_avx512_vnni);

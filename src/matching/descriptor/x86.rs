@@ -94,6 +94,18 @@ unsafe impl Kernel for Avx512Vnni {
         // SAFETY: the instructions are the caller's matter.
         unsafe { _mm512_mask_mov_epi32(otherwise, _mm512_cmplt_epi32_mask(a, b), if_less) }
     }
+
+    #[inline(always)]
+    unsafe fn near(line: &[f32; 3], half_width: f32, x: &[f32; GROUP_ROWS], y: &[f32; GROUP_ROWS]) -> Self::Lanes {
+        // SAFETY: twice 64 bytes are there; the instructions are the caller's matter.
+        unsafe {
+            let [a, b, c] = line.map(|coefficient| _mm512_set1_ps(coefficient));
+            let (x, y) = (_mm512_loadu_ps(x.as_ptr()), _mm512_loadu_ps(y.as_ptr()));
+            let signed = _mm512_add_ps(_mm512_add_ps(_mm512_mul_ps(a, x), _mm512_mul_ps(b, y)), c);
+            let near = _mm512_cmp_ps_mask::<_CMP_LE_OQ>(_mm512_abs_ps(signed), _mm512_set1_ps(half_width));
+            _mm512_maskz_set1_epi32(near, 1)
+        }
+    }
 }
 
 /// What the two kernels with 256-bit vectors share: sixteen lanes are two vectors.
@@ -154,6 +166,21 @@ macro_rules! halves {
             // SAFETY: the instructions are the caller's matter.
             unsafe {
                 std::array::from_fn(|h| _mm256_blendv_epi8(otherwise[h], if_less[h], _mm256_cmpgt_epi32(b[h], a[h])))
+            }
+        }
+
+        #[inline(always)]
+        unsafe fn near(line: &[f32; 3], half_width: f32, x: &[f32; GROUP_ROWS], y: &[f32; GROUP_ROWS]) -> Self::Lanes {
+            // SAFETY: twice two times 32 bytes are there; the instructions are the caller's matter.
+            unsafe {
+                let [a, b, c] = line.map(|coefficient| _mm256_set1_ps(coefficient));
+                let (sign, half_width) = (_mm256_set1_ps(-0.0), _mm256_set1_ps(half_width));
+                std::array::from_fn(|h| {
+                    let (x, y) = (_mm256_loadu_ps(x.as_ptr().add(8 * h)), _mm256_loadu_ps(y.as_ptr().add(8 * h)));
+                    let signed = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(a, x), _mm256_mul_ps(b, y)), c);
+                    let near = _mm256_cmp_ps::<_CMP_LE_OQ>(_mm256_andnot_ps(sign, signed), half_width);
+                    _mm256_srli_epi32::<31>(_mm256_castps_si256(near))
+                })
             }
         }
     };
