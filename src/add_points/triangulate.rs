@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::guided_match::KeypointMatch;
 use super::views::{Sighting, ViewTable};
-use crate::geometry::triangulation::{refine_point, triangulate_dlt};
+use crate::geometry::triangulation::refine_point;
 use crate::scene::{ImageId, KeypointIdx, Reconstruction};
 
 /// The matches of one pair.
@@ -143,11 +143,9 @@ pub fn refit(
         return None;
     }
     for _ in 0..MAX_REFITS {
+        // The start is near: a crossing of two of the rays, or a point of the model.
         let views: Vec<_> = granted.iter().map(|&seen| table.view(seen)).collect();
-        // The linear point can lie behind a camera when rays are nearly parallel; the start is then the better one.
-        let linear = triangulate_dlt(&views).map(|linear| refine_point(&views, &linear));
-        let fitted = linear.filter(|fitted| fitted.iter().all(|c| c.is_finite()));
-        let Some(fitted) = fitted else { break };
+        let fitted = refine_point(&views, &xyz);
         let fitted_granted = inliers(&fitted);
         if fitted_granted.len() < granted.len() {
             break;

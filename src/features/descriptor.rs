@@ -38,6 +38,10 @@ const CLIP: f32 = 0.2;
 /// Quantisation of the square roots.
 const QUANTISATION: f32 = 512.0;
 
+/// From this sigma on, in pixels of its level, every second row is looked at: what a Gaussian of this width leaves of an image
+/// turns so slowly that the rows between tell next to nothing, and a bin still holds two or three rows.
+const SPARSE_ROWS_FROM_SIGMA: f32 = 1.4;
+
 /// How far a descriptor at a keypoint of this sigma reaches, in the same pixels.
 pub(super) fn radius_px(sigma: f32) -> f32 {
     SQRT_2 * REACH * BIN_SIGMAS * sigma + 1.0
@@ -93,7 +97,10 @@ impl Describer {
         let (from, to) = clip(x, radius, width);
         let falloff = -1.0 / (FALLOFF * bin * bin);
         patch.set_window(x, falloff, from, to);
-        for row in top..bottom {
+        let every = if sigma >= SPARSE_ROWS_FROM_SIGMA { 2 } else { 1 };
+        // The keypoint's own row is one of them, wherever it lies.
+        let first = top + (y.round() as usize).abs_diff(top) % every;
+        for row in (first..bottom).step_by(every) {
             let dy = row as f32 - y;
             let (u, v) = (sin * dy / bin, cos * dy / bin);
             let (low_u, high_u) = inside(u, du);

@@ -60,35 +60,25 @@ pub fn triangulate_dlt(views: &[View]) -> Option<Vector3<f64>> {
 
 /// Gauss-Newton steps of [`refine_point`]; it converges in two or three.
 const MAX_REFINEMENTS: usize = 10;
-/// A relative step that ends the refinement.
-const TINY_RELATIVE_STEP: f64 = 1e-10;
+/// A relative step that ends the refinement: what is left after it is the square of it.
+const TINY_RELATIVE_STEP: f64 = 1e-7;
 
 /// Moves a point to the least sum of squared reprojection errors on the planes z = 1 of its views, by Gauss-Newton
 /// steps that are kept only while the error falls. A point not in front of all views is returned as it is.
 pub fn refine_point(views: &[View], xyz: &Vector3<f64>) -> Vector3<f64> {
+    let views: Vec<(Matrix3<f64>, Vector3<f64>, Vector2<f64>)> =
+        views.iter().map(|(pose, seen)| (pose.rotation_matrix(), pose.translation, seen.0)).collect();
+    let Some(mut here) = Linearised::at(&views, xyz) else { return *xyz };
     let mut at = *xyz;
-    let Some(mut cost) = reprojection_cost(views, &at) else { return at };
     for _ in 0..MAX_REFINEMENTS {
-        // r = (x / z, y / z) - seen;  dr/dX = 1/z [1 0 -x/z; 0 1 -y/z] R
-        let mut hessian = Matrix3::zeros();
-        let mut gradient = Vector3::zeros();
-        for (cam_from_world, seen) in views {
-            let x_in_cam = cam_from_world.apply(&at);
-            let inverse_z = 1.0 / x_in_cam.z;
-            let projected = Vector2::new(x_in_cam.x * inverse_z, x_in_cam.y * inverse_z);
-            let by_cam = Matrix2x3::new(1.0, 0.0, -projected.x, 0.0, 1.0, -projected.y) * inverse_z;
-            let jacobian = by_cam * cam_from_world.rotation_matrix();
-            hessian += jacobian.transpose() * jacobian;
-            gradient += jacobian.transpose() * (projected - seen.0);
-        }
-        let Some(step) = hessian.cholesky().map(|factor| factor.solve(&gradient)) else { break };
+        let Some(step) = here.hessian.cholesky().map(|factor| factor.solve(&here.gradient)) else { break };
         let next = at - step;
-        let Some(next_cost) = reprojection_cost(views, &next) else { break };
-        if next_cost >= cost {
+        let Some(there) = Linearised::at(&views, &next) else { break };
+        if there.cost >= here.cost {
             break;
         }
         let small = step.norm() <= TINY_RELATIVE_STEP * at.norm();
-        (at, cost) = (next, next_cost);
+        (at, here) = (next, there);
         if small {
             break;
         }
@@ -96,17 +86,33 @@ pub fn refine_point(views: &[View], xyz: &Vector3<f64>) -> Vector3<f64> {
     at
 }
 
-/// The sum of squared errors on the planes z = 1; none when a view has the point behind it.
-fn reprojection_cost(views: &[View], xyz: &Vector3<f64>) -> Option<f64> {
-    let mut cost = 0.0;
-    for (cam_from_world, seen) in views {
-        let x_in_cam = cam_from_world.apply(xyz);
-        if x_in_cam.z.is_nan() || x_in_cam.z <= 0.0 {
-            return None;
+/// The normal equations of a point's reprojection errors on the planes z = 1.
+struct Linearised {
+    cost: f64,
+    hessian: Matrix3<f64>,
+    gradient: Vector3<f64>,
+}
+
+impl Linearised {
+    /// With `r = (x / z, y / z) - seen` and `dr/dX = 1/z [1 0 -x/z; 0 1 -y/z] R`; none when a view has the point behind it.
+    fn at(views: &[(Matrix3<f64>, Vector3<f64>, Vector2<f64>)], xyz: &Vector3<f64>) -> Option<Self> {
+        let mut sums = Self { cost: 0.0, hessian: Matrix3::zeros(), gradient: Vector3::zeros() };
+        for (rotation, translation, seen) in views {
+            let x_in_cam = rotation * xyz + translation;
+            if x_in_cam.z.is_nan() || x_in_cam.z <= 0.0 {
+                return None;
+            }
+            let inverse_z = 1.0 / x_in_cam.z;
+            let projected = x_in_cam.xy() * inverse_z;
+            let by_cam = Matrix2x3::new(1.0, 0.0, -projected.x, 0.0, 1.0, -projected.y) * inverse_z;
+            let jacobian = by_cam * rotation;
+            let error = projected - seen;
+            sums.cost += error.norm_squared();
+            sums.hessian += jacobian.transpose() * jacobian;
+            sums.gradient += jacobian.transpose() * error;
         }
-        cost += (x_in_cam.xy() / x_in_cam.z - seen.0).norm_squared();
+        sums.cost.is_finite().then_some(sums)
     }
-    cost.is_finite().then_some(cost)
 }
 
 /// [`triangulate_dlt`], then [`refine_point`]; none unless the point is in front of all views.

@@ -38,7 +38,7 @@ pub enum RobustLoss {
 
 impl RobustLoss {
     /// The loss `rho(s)` and the weight `rho'(s)` of a squared residual `s`.
-    #[inline]
+    #[inline(always)]
     pub fn evaluate(self, s: f64) -> (f64, f64) {
         match self {
             Self::Trivial => (s, 1.0),

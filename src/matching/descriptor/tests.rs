@@ -81,6 +81,25 @@ fn a_subset_is_numbered_by_its_list_and_memory_is_reused() {
     }
 }
 
+#[cfg(target_arch = "x86_64")]
+#[test]
+fn packing_is_the_same_with_and_without_vectors() {
+    use super::packed::{GROUP_ROWS, Line, QUADS, pack_group_plainly};
+    if !std::is_x86_feature_detected!("avx2") {
+        println!("SKIPPED: this machine has no AVX2");
+        return;
+    }
+    let descriptors = descriptors(&mut Rng::from_parts(&[3]), GROUP_ROWS);
+    let rows = std::array::from_fn(|row| &descriptors[row]);
+    let empty = || ([Line([[0; 4]; GROUP_ROWS]); QUADS], [0; GROUP_ROWS]);
+    let ((mut plain, mut plain_biases), (mut lines, mut biases)) = (empty(), empty());
+    pack_group_plainly(&rows, &mut plain, &mut plain_biases);
+    // SAFETY: AVX2 is there.
+    unsafe { super::x86::pack_group(&rows, &mut lines, &mut biases) };
+    assert_eq!(biases, plain_biases);
+    assert!(lines.iter().zip(&plain).all(|(a, b)| a.0 == b.0));
+}
+
 /// Rows in a few sections, queries with random lines, and windows that hold more than their bands: every tier finds what the
 /// definition says.
 #[test]
