@@ -9,7 +9,8 @@
 //! - [`line_groups`] (6.2.2): features that share a line share the search;
 //! - [`guided_match`](mod@guided_match) (6.2.2, 6.2.3): best descriptor along the line, ratio test after the geometry;
 //! - [`triangulate`] (6.3): each image's matches as tracks, and their points;
-//! - [`merge`] (6.3): the pieces of one point made one.
+//! - [`merge`] (6.3): the pieces of one point made one;
+//! - [`strays`]: points that rest on one match and lie where nothing else is, taken out at the end.
 //!
 //! A pair is a unit of work ([`match_pair`]): a pure function of the model, both images' features, options and seed. Poses
 //! are not changed; every pair and every image is independent of the others, and results are put together in id order, so
@@ -26,6 +27,7 @@ pub mod one_way;
 mod options;
 pub mod pencil;
 pub mod prepared;
+pub mod strays;
 pub mod sweep;
 #[cfg(test)]
 mod test_scene;
@@ -48,6 +50,7 @@ pub use options::{
     AddPointsOptions, BlockOptions, CandidatePairOptions, GuidedMatchOptions, PixelScaling, TriangulationOptions,
 };
 pub use prepared::PreparedImage;
+pub use strays::{StrayOptions, remove_strays};
 pub use triangulate::PairMatches;
 
 use crate::scene::{Features, ImageId, KeypointIdx, Reconstruction};

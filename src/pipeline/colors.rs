@@ -1,98 +1,110 @@
-//! Colours of the points and thumbnails of the photographs, from one colour decoding of each.
+//! Colours of the points and thumbnails of the photographs, from what the features stage saw when it decoded them.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
-use super::intake::Intake;
-use super::runner::StageProgress;
+use super::features::ImageFeatures;
+use super::runner::{StageProgress, io_error};
 use super::state::PipelineState;
-use super::{Context, PipelineError};
-use crate::formats::photograph::{self, Photograph, PhotographLimits};
-use crate::scene::{ImageId, Point3dId, RgbImage};
+use super::{Context, PipelineError, Stage};
+use crate::formats::photograph::{self, Decoded};
+use crate::scene::{Features, ImageId, RgbImage};
+use crate::store::ArtifactStore;
 
 /// Small JPEGs by image.
 pub type Thumbnails = BTreeMap<ImageId, Vec<u8>>;
 
 /// Long side of a decoding for colours: finer detail than this does not change a point's colour.
-const COLOR_LONG_SIDE_PX: u32 = 1600;
+pub(super) const COLOR_LONG_SIDE_PX: u32 = 1600;
 /// Long side of a thumbnail.
 const THUMBNAIL_LONG_SIDE_PX: u32 = 240;
 /// JPEG quality of a thumbnail.
 const THUMBNAIL_QUALITY: u8 = 75;
 
-/// What one photograph gives: its sightings' colours by model and point, and its thumbnail.
-type Seen = (Option<(usize, Vec<(Point3dId, [u8; 3])>)>, Option<Vec<u8>>);
+/// What is kept of a photograph's colours.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Look {
+    /// Colour at every feature.
+    colors: Vec<[u8; 3]>,
+    /// A small JPEG.
+    thumbnail: Vec<u8>,
+}
 
-/// Gives every point the mean colour of its sightings and makes the thumbnails. A photograph that can't be decoded again
-/// leaves its share out.
+impl Look {
+    /// Of a decoded photograph, at its features (in pixels of the original).
+    pub(super) fn of(picture: Decoded<RgbImage>, features: &Features) -> Self {
+        let Decoded { image, to_original: [across, down] } = picture;
+        let at = |x: f32, y: f32| image.at(f64::from(x) / across, f64::from(y) / down);
+        let colors = features.keypoints.iter().map(|keypoint| at(keypoint.x, keypoint.y)).collect();
+        let small = photograph::shrink_rgb(image, Some(THUMBNAIL_LONG_SIDE_PX)).image;
+        // Encoding into memory has no reason to fail; without a thumbnail the report shows a blank.
+        Self { colors, thumbnail: photograph::encode_jpeg(&small, THUMBNAIL_QUALITY).unwrap_or_default() }
+    }
+
+    /// As bytes.
+    pub(super) fn to_bytes(&self) -> Vec<u8> {
+        postcard::to_stdvec(self).expect("plain data serialise")
+    }
+
+    fn from_bytes(bytes: &[u8]) -> Option<Self> {
+        postcard::from_bytes(bytes).ok()
+    }
+}
+
+/// Gives every point the mean colour of its sightings and collects the thumbnails. Images without a look (ready features
+/// have none) leave their share out.
+///
+/// # Errors
+/// Cancellation, and looks that can't be read back.
 pub fn run(
-    folder: &Path,
-    intake: &Intake,
-    limits: &PhotographLimits,
+    store: &ArtifactStore,
+    found: &BTreeMap<ImageId, ImageFeatures>,
     state: &mut PipelineState,
     context: &Context,
     progress: &StageProgress<'_>,
 ) -> Result<Thumbnails, PipelineError> {
-    let located = state.located();
-    let photographs: Vec<_> = intake.photographs().map(|(id, file, _)| (id, folder.join(&file.name))).collect();
-    let seen: Vec<(ImageId, Seen)> = photographs
+    let looks: Vec<(ImageId, Option<Look>)> = found
         .par_iter()
-        .map(|(id, path)| {
+        .map(|(&id, image)| {
             context.check_cancelled()?;
-            let picture = std::fs::read(path).ok().and_then(|bytes| {
-                Photograph::open(&bytes, limits)
-                    .and_then(|photograph| photograph.decode_rgb(Some(COLOR_LONG_SIDE_PX)))
-                    .ok()
-            });
+            let look = match &image.look_key {
+                Some(key) => {
+                    let bytes = store.get(key).map_err(|source| io_error(Stage::Export, Path::new(key), source))?;
+                    bytes.and_then(|bytes| Look::from_bytes(&bytes))
+                }
+                None => None,
+            };
             progress.tick();
-            let Some(picture) = picture else { return Ok((*id, (None, None))) };
-            let colors = located
-                .get(id)
-                .map(|&rank| (rank, sightings(&state.models[rank].model, *id, &picture.image, picture.to_original)));
-            let small = photograph::shrink_rgb(picture.image, Some(THUMBNAIL_LONG_SIDE_PX)).image;
-            Ok((*id, (colors, photograph::encode_jpeg(&small, THUMBNAIL_QUALITY).ok())))
+            Ok((id, look))
         })
         .collect::<Result<_, PipelineError>>()?;
-    let mut sums: Vec<BTreeMap<Point3dId, ([u32; 3], u32)>> = vec![BTreeMap::new(); state.models.len()];
-    let mut thumbnails = Thumbnails::new();
-    for (id, (colors, thumbnail)) in seen {
-        for (rank, (point, color)) in
-            colors.into_iter().flat_map(|(rank, colors)| colors.into_iter().map(move |seen| (rank, seen)))
-        {
-            let (sum, count) = sums[rank].entry(point).or_insert(([0; 3], 0));
-            for (total, value) in sum.iter_mut().zip(color) {
-                *total += u32::from(value);
+    let looks: BTreeMap<ImageId, Look> = looks.into_iter().filter_map(|(id, look)| Some((id, look?))).collect();
+    for account in &mut state.models {
+        let mut colors = Vec::with_capacity(account.model.num_points());
+        for (id, point) in account.model.points() {
+            let (mut sum, mut count) = ([0u32; 3], 0u32);
+            for seen in &point.track {
+                let color = looks.get(&seen.image).and_then(|look| look.colors.get(seen.keypoint.index()));
+                let Some(color) = color else { continue };
+                for (total, &value) in sum.iter_mut().zip(color) {
+                    *total += u32::from(value);
+                }
+                count += 1;
             }
-            *count += 1;
+            if count > 0 {
+                colors.push((id, sum.map(|total| ((total + count / 2) / count) as u8)));
+            }
         }
-        if let Some(thumbnail) = thumbnail {
-            thumbnails.insert(id, thumbnail);
-        }
-    }
-    for (account, sums) in state.models.iter_mut().zip(sums) {
-        for (point, (sum, count)) in sums {
-            account.model.set_color(point, sum.map(|total| ((total + count / 2) / count) as u8));
+        for (id, color) in colors {
+            account.model.set_color(id, color);
         }
     }
-    Ok(thumbnails)
-}
-
-/// The colour of every point an image sees.
-fn sightings(
-    model: &crate::scene::Reconstruction,
-    id: ImageId,
-    picture: &RgbImage,
-    to_original: [f64; 2],
-) -> Vec<(Point3dId, [u8; 3])> {
-    let image = &model.images()[&id];
-    image
-        .points()
-        .iter()
-        .zip(image.keypoints.iter())
-        .filter_map(|(point, pixel)| {
-            Some(((*point)?, picture.at(pixel.0.x / to_original[0], pixel.0.y / to_original[1])))
-        })
-        .collect()
+    Ok(looks
+        .into_iter()
+        .filter(|(_, look)| !look.thumbnail.is_empty())
+        .map(|(id, look)| (id, look.thumbnail))
+        .collect())
 }

@@ -1,11 +1,12 @@
 //! The export stage: every model as COLMAP, Bundler and PLY files, then the reports.
 
+use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use super::colors::{self, Thumbnails};
+use super::features::ImageFeatures;
 use super::intake::Intake;
-use super::options::IntakeOptions;
 use super::run::RunPaths;
 use super::runner::{StageProgress, io_error};
 use super::state::PipelineState;
@@ -13,17 +14,19 @@ use super::{Context, PipelineError, Stage};
 use crate::formats::report::Report;
 use crate::formats::{bundler, colmap, ply, report_html};
 use crate::scene::{ImageId, Reconstruction};
+use crate::store::ArtifactStore;
 
 /// Colours the points and writes the models. Returns them, coloured, with the thumbnails for the report.
 pub fn run(
     paths: &RunPaths,
     intake: &Intake,
-    options: &IntakeOptions,
+    found: &BTreeMap<ImageId, ImageFeatures>,
+    store: &ArtifactStore,
     mut state: PipelineState,
     context: &Context,
     progress: &StageProgress<'_>,
 ) -> Result<(PipelineState, Thumbnails), PipelineError> {
-    let thumbnails = colors::run(&paths.images_dir, intake, &options.limits(), &mut state, context, progress)?;
+    let thumbnails = colors::run(store, found, &mut state, context, progress)?;
     for folder in ["sparse", "bundle", "ply"] {
         let folder = paths.out_dir.join(folder);
         match std::fs::remove_dir_all(&folder) {

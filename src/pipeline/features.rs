@@ -7,9 +7,11 @@ use std::sync::{Arc, Mutex};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::colors::{COLOR_LONG_SIDE_PX, Look};
 use super::intake::{InputFile, Intake, Refusal, advice};
 use super::masks::Mask;
 use super::options::ReconstructionOptions;
+use super::runner::erased::Part;
 use super::runner::{ArtifactKey, Counts, StageProgress, counts, io_error};
 use super::{Context, PipelineError, Stage, ready_features};
 use crate::features::extract_where;
@@ -23,6 +25,8 @@ use crate::store::ArtifactStore;
 pub struct ImageFeatures {
     /// Key of the feature file.
     pub key: String,
+    /// Key of the picture's [`Look`]; none when no picture was decoded.
+    pub look_key: Option<String>,
     /// Number of features, or why the picture can't be used after all.
     pub count: Result<usize, Refusal>,
 }
@@ -52,30 +56,38 @@ pub fn run(
             context.check_cancelled()?;
             let mask = file.mask.as_ref();
             let mask_sha256 = mask.map(|mask| &mask.sha256);
-            let key = ArtifactKey::of(
-                "features",
-                &[&file.sha256, &mask_sha256, &options.features, &options.intake.max_long_side_px],
-            )
-            .0;
-            let stored = store.get(&key).map_err(|source| io_error(Stage::Features, Path::new(&key), source))?;
-            let stored = stored.and_then(|bytes| feature_file::from_bytes(&bytes, None).ok());
+            let parts: [&dyn Part; 4] =
+                [&file.sha256, &mask_sha256, &options.features, &options.intake.max_long_side_px];
+            let key = ArtifactKey::of("features", &parts).0;
+            let look_key = ArtifactKey::of("look", &parts).0;
+            let failed = |source| io_error(Stage::Features, Path::new(&key), source);
+            let ready = ready.get(&file.name);
+            let stored = store.get(&key).map_err(failed)?.and_then(|bytes| feature_file::from_bytes(&bytes, None).ok());
+            // Features without their look would make points without colours.
+            let is_whole = ready.is_some() || store.get(&look_key).map_err(failed)?.is_some();
+            let stored = stored.filter(|_| is_whole);
             let reused = stored.is_some();
-            let count = match stored {
-                Some(features) => Ok(features.len()),
-                None => match ready
-                    .get(&file.name)
-                    .map_or_else(|| extract_one(folder, file, options), |path| ready_features::read(path))?
-                {
+            let count = match (stored, ready) {
+                (Some(features), _) => Ok(features.len()),
+                (None, Some(path)) => match ready_features::read(path)? {
                     Ok(features) => {
-                        let bytes = feature_file::to_bytes(&features);
-                        store.put(&key, &bytes).map_err(|source| io_error(Stage::Features, Path::new(&key), source))?;
+                        store.put(&key, &feature_file::to_bytes(&features)).map_err(failed)?;
+                        Ok(features.len())
+                    }
+                    Err(refusal) => Err(refusal),
+                },
+                (None, None) => match extract_one(folder, file, options)? {
+                    Ok((features, look)) => {
+                        store.put(&look_key, &look.to_bytes()).map_err(failed)?;
+                        store.put(&key, &feature_file::to_bytes(&features)).map_err(failed)?;
                         Ok(features.len())
                     }
                     Err(refusal) => Err(refusal),
                 },
             };
+            let look_key = ready.is_none().then_some(look_key);
             progress.tick();
-            Ok((*id, ImageFeatures { key, count }, reused))
+            Ok((*id, ImageFeatures { key, look_key, count }, reused))
         })
         .collect();
     let extracted: Vec<(ImageId, ImageFeatures, bool)> = extracted.into_iter().collect::<Result<_, _>>()?;
@@ -85,17 +97,18 @@ pub fn run(
     Ok((extracted.into_iter().map(|(id, image, _)| (id, image)).collect(), totals))
 }
 
-/// SIFT of one file where its mask keeps it, in pixels of the original picture.
+/// SIFT of one file where its mask keeps it, in pixels of the original picture, and what its colours are.
 fn extract_one(
     folder: &Path,
     file: &InputFile,
     options: &ReconstructionOptions,
-) -> Result<Result<Features, Refusal>, PipelineError> {
+) -> Result<Result<(Features, Look), Refusal>, PipelineError> {
     let path = folder.join(&file.name);
     let bytes = std::fs::read(&path).map_err(|source| io_error(Stage::Features, &path, source))?;
-    let decoded = Photograph::open(&bytes, &options.intake.limits())
-        .and_then(|photograph| photograph.decode_gray(Some(options.intake.max_long_side_px)));
-    let decoded = match decoded {
+    let decoded = Photograph::open(&bytes, &options.intake.limits()).and_then(|photograph| {
+        photograph.decode_gray_and_rgb(Some(options.intake.max_long_side_px), Some(COLOR_LONG_SIDE_PX))
+    });
+    let (decoded, picture) = match decoded {
         Ok(decoded) => decoded,
         Err(error) => return Ok(Err(Refusal { code: error.code().to_owned(), advice: advice(&error) })),
     };
@@ -114,7 +127,8 @@ fn extract_one(
         keypoint.y = (f64::from(keypoint.y) * scale_y) as f32;
         keypoint.scale = (f64::from(keypoint.scale) * (scale_x * scale_y).sqrt()) as f32;
     }
-    Ok(Ok(features))
+    let look = Look::of(picture, &features);
+    Ok(Ok((features, look)))
 }
 
 /// Features read back when needed, the most recently used kept up to a budget of bytes.

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::PipelineError;
 use super::focals::FocalOptions;
 use crate::add_cameras::AddCamerasOptions;
-use crate::add_points::AddPointsOptions;
+use crate::add_points::{AddPointsOptions, StrayOptions};
 use crate::bundle::BundleOptions;
 use crate::camera::CameraModel;
 use crate::coarse::MapperOptions;
@@ -151,8 +151,13 @@ impl Default for CoarseOptions {
 pub struct RefineOptions {
     /// Whether it is done at all; the paper does without (section 3).
     pub enabled: bool,
-    /// Rounds of adjusting and filtering, by the limits of `coarse.mapper`.
+    /// Rounds of adjusting and filtering, by the limits of `coarse.mapper` but for the angle below.
     pub rounds: usize,
+    /// Smallest of the largest angles between two rays of a point that stays, in degrees. Raising it removes points whose
+    /// depth is uncertain: at 2 degrees by thirty times the error across the ray.
+    pub min_triangulation_angle_deg: f64,
+    /// Which points of two sightings are taken for wrong matches.
+    pub strays: StrayOptions,
     /// The adjustment. Robust by default: guided matches hold a few wrong ones within the limits. Measured against least
     /// squares: temple ring AUC@1 80 for 78, the surveyed fountain unchanged. Reweighting nears its end in many small steps: at a
     /// tolerance of 1e-4 it takes half the time of 1e-6 and the poses are as good.
@@ -164,6 +169,8 @@ impl Default for RefineOptions {
         Self {
             enabled: true,
             rounds: 2,
+            min_triangulation_angle_deg: 2.0,
+            strays: StrayOptions::default(),
             bundle: BundleOptions {
                 loss: RobustLoss::Cauchy { scale: 1.0 },
                 function_tolerance: 1e-4,
@@ -202,6 +209,7 @@ impl ReconstructionOptions {
         self.add_cameras.validate(&mut errors);
         self.add_points.validate(&mut errors);
         self.refine.bundle.validate(&mut errors);
+        self.refine.strays.validate(&mut errors);
         let mut check = |holds: bool, message: &str| {
             if !holds {
                 errors.push(message.to_owned());
@@ -214,6 +222,10 @@ impl ReconstructionOptions {
             "intake.default_focal must be in (0.1, 10)",
         );
         check((0.0..=1.0).contains(&self.coarse.enough_registered), "coarse.enough_registered must be in [0, 1]");
+        check(
+            (0.0..90.0).contains(&self.refine.min_triangulation_angle_deg),
+            "refine.min_triangulation_angle_deg must be from 0 to below 90",
+        );
         check((1..=10).contains(&self.iterations), "iterations must be from 1 to 10");
         for (name, known) in self
             .intake

@@ -1,8 +1,9 @@
 //! The last adjustment: everything free that the photographs determine, then filtering, a few rounds.
 
 use super::options::ReconstructionOptions;
+use crate::add_points::remove_strays;
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
-use crate::coarse::{filter, free_intrinsics, merge_agreeing_cameras};
+use crate::coarse::{KeepLimits, filter, free_intrinsics, merge_agreeing_cameras};
 use crate::scene::{Point3dId, Reconstruction};
 
 /// Refines a model in place.
@@ -13,8 +14,11 @@ pub fn refine(model: &mut Reconstruction, options: &ReconstructionOptions) {
         config.intrinsics = free_intrinsics(model, &options.coarse.mapper.intrinsics);
         bundle::adjust(model, &config, &options.refine.bundle);
         let all: Vec<Point3dId> = model.points().map(|(id, _)| id).collect();
-        if filter(model, &all, &options.coarse.mapper.keep_limits()) == 0 {
+        let min_triangulation_angle_rad = options.refine.min_triangulation_angle_deg.to_radians();
+        let limits = KeepLimits { min_triangulation_angle_rad, ..options.coarse.mapper.keep_limits() };
+        if filter(model, &all, &limits) == 0 {
             break;
         }
     }
+    remove_strays(model, &options.refine.strays);
 }

@@ -231,9 +231,8 @@ impl Pipeline<'_> {
         let (state, thumbnails) = {
             let mut thumbnails = BTreeMap::new();
             let mut exported = None;
-            runner.stage(key(Stage::Export), None, images, |_, progress| {
-                let (state, made) =
-                    export::run(self.paths, intake, &self.options.intake, state, self.context, progress)?;
+            runner.stage(key(Stage::Export), None, images, |store, progress| {
+                let (state, made) = export::run(self.paths, intake, found, store, state, self.context, progress)?;
                 thumbnails = made;
                 let models = state.models.len();
                 exported = Some(state);

@@ -39,6 +39,12 @@ fn assert_shows_the_picture(bytes: &[u8], tolerance: f64) {
     let gray = photograph.decode_gray(None).unwrap();
     assert_eq!(gray.to_original, [1.0, 1.0]);
     let rgb = photograph.decode_rgb(None).unwrap().image;
+    // Grey and colour from one reading: the same grey to the bit, the same colours but for rounding.
+    let (same_gray, same_rgb) = photograph.decode_gray_and_rgb(None, None).unwrap();
+    assert_eq!(same_gray, gray);
+    assert!(same_rgb.image.data.iter().zip(&rgb.data).all(|(a, b)| a.abs_diff(*b) <= 3));
+    let small = photograph.decode_gray_and_rgb(None, Some(40)).unwrap().1;
+    assert_eq!((small.image.width, small.to_original), (40, [3.0, 80.0 / 27.0]));
     for y in 0..HEIGHT as usize {
         for x in 0..WIDTH as usize {
             let found = f64::from(gray.image.data[y * WIDTH as usize + x]);

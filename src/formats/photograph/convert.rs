@@ -27,6 +27,21 @@ pub(super) fn rgb_to_gray(image: &RgbImage) -> GrayImage {
     GrayImage::new(image.width, image.height, data)
 }
 
+/// A grey raster as colour.
+pub(super) fn gray_to_rgb(image: &GrayImage) -> RgbImage {
+    RgbImage::new(image.width, image.height, image.data.iter().flat_map(|&v| [v; 3]).collect())
+}
+
+/// The colours of JPEG files (ITU-T T.871, section 7) to RGB, in place, in units of 2^-16.
+pub(super) fn ycbcr_to_rgb(data: &mut [u8]) {
+    let byte = |value: i32| ((value + (1 << 15)) >> 16).clamp(0, 255) as u8;
+    for pixel in data.as_chunks_mut::<3>().0 {
+        let [y, cb, cr] = pixel.map(i32::from);
+        let (y, cb, cr) = (y << 16, cb - 128, cr - 128);
+        *pixel = [byte(y + 91_881 * cr), byte(y - 22_554 * cb - 46_802 * cr), byte(y + 116_130 * cb)];
+    }
+}
+
 /// Grey of anything; alpha is ignored.
 pub(super) fn to_gray(image: &DynamicImage) -> GrayImage {
     let (width, height) = (image.width() as usize, image.height() as usize);
@@ -56,7 +71,7 @@ pub(super) fn to_rgb(image: &DynamicImage) -> RgbImage {
         DynamicImage::ImageLuma8(_)
         | DynamicImage::ImageLumaA8(_)
         | DynamicImage::ImageLuma16(_)
-        | DynamicImage::ImageLumaA16(_) => to_gray(image).data.into_iter().flat_map(|v| [v; 3]).collect(),
+        | DynamicImage::ImageLumaA16(_) => return gray_to_rgb(&to_gray(image)),
         // Kinds the image crate may add later.
         _ => image.to_rgb8().into_raw(),
     };

@@ -1,6 +1,7 @@
 //! JPEG: the size from the frame header, completeness from the markers, pixels from zune-jpeg.
 //!
-//! A grey decode asks zune-jpeg for luma alone, which skips the chroma planes. Markers are as in ITU-T T.81, annex B.
+//! A grey decode asks zune-jpeg for luma alone, which skips the chroma planes; where both grey and colour are wanted, luma and
+//! chroma come from one pass over the entropy-coded data, the dearest part of decoding. Markers are as in ITU-T T.81, annex B.
 
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::errors::DecodeErrors;
@@ -8,7 +9,7 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-use super::{PhotographError, convert};
+use super::{Decoded, PhotographError, convert};
 use crate::scene::{GrayImage, RgbImage};
 
 /// What the frame header says.
@@ -106,7 +107,7 @@ pub(super) fn has_end(bytes: &[u8]) -> bool {
 
 /// Luma.
 pub(super) fn decode_gray(bytes: &[u8]) -> Result<GrayImage, PhotographError> {
-    match decode(bytes, true)? {
+    match decode(bytes, |stored| if has_luma(stored) { ColorSpace::Luma } else { ColorSpace::RGB })? {
         (ColorSpace::Luma, width, height, data) => Ok(GrayImage::new(width, height, data)),
         (_, width, height, data) => Ok(convert::rgb_to_gray(&RgbImage::new(width, height, data))),
     }
@@ -114,21 +115,55 @@ pub(super) fn decode_gray(bytes: &[u8]) -> Result<GrayImage, PhotographError> {
 
 /// Colour.
 pub(super) fn decode_rgb(bytes: &[u8]) -> Result<RgbImage, PhotographError> {
-    let (_, width, height, data) = decode(bytes, false)?;
+    let (_, width, height, data) = decode(bytes, |_| ColorSpace::RGB)?;
     Ok(RgbImage::new(width, height, data))
 }
 
-/// Decodes to luma when wanted and directly possible (YCbCr and grey files), else to RGB; tells which it was.
-fn decode(bytes: &[u8], prefer_luma: bool) -> Result<(ColorSpace, usize, usize, Vec<u8>), PhotographError> {
+/// Luma in full size, and colour with its longer side reduced to `max_long_side` where it is longer.
+pub(super) fn decode_gray_and_rgb(
+    bytes: &[u8],
+    max_long_side: Option<u32>,
+) -> Result<(GrayImage, Decoded<RgbImage>), PhotographError> {
+    let wanted = |stored| match stored {
+        Some(as_stored @ (ColorSpace::YCbCr | ColorSpace::Luma)) => as_stored,
+        _ => ColorSpace::RGB,
+    };
+    match decode(bytes, wanted)? {
+        (ColorSpace::Luma, width, height, data) => {
+            let gray = GrayImage::new(width, height, data);
+            let rgb = convert::gray_to_rgb(&gray);
+            Ok((gray, convert::shrink_rgb(rgb, max_long_side)))
+        }
+        (ColorSpace::YCbCr, width, height, data) => {
+            let gray = GrayImage::new(width, height, data.iter().step_by(3).copied().collect());
+            // Averages commute with the change of colours, which is linear, and less remains to be changed.
+            let mut small = convert::shrink_rgb(RgbImage::new(width, height, data), max_long_side);
+            convert::ycbcr_to_rgb(&mut small.image.data);
+            Ok((gray, small))
+        }
+        (_, width, height, data) => {
+            let rgb = RgbImage::new(width, height, data);
+            Ok((convert::rgb_to_gray(&rgb), convert::shrink_rgb(rgb, max_long_side)))
+        }
+    }
+}
+
+fn has_luma(stored: Option<ColorSpace>) -> bool {
+    matches!(stored, Some(ColorSpace::YCbCr | ColorSpace::Luma))
+}
+
+/// Decodes to the colours that `wanted` names, given those stored; tells which they were.
+fn decode(
+    bytes: &[u8],
+    wanted: impl FnOnce(Option<ColorSpace>) -> ColorSpace,
+) -> Result<(ColorSpace, usize, usize, Vec<u8>), PhotographError> {
     let options = DecoderOptions::default()
         .set_max_width(usize::from(u16::MAX))
         .set_max_height(usize::from(u16::MAX))
         .set_strict_mode(false);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(from_decode_error)?;
-    let stored = decoder.input_colorspace();
-    let has_luma = matches!(stored, Some(ColorSpace::YCbCr | ColorSpace::Luma));
-    let colorspace = if prefer_luma && has_luma { ColorSpace::Luma } else { ColorSpace::RGB };
+    let colorspace = wanted(decoder.input_colorspace());
     decoder.set_options(options.jpeg_set_out_colorspace(colorspace));
     let data = decoder.decode().map_err(from_decode_error)?;
     let (width, height) =

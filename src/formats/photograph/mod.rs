@@ -198,6 +198,25 @@ impl<'a> Photograph<'a> {
         Ok(convert::shrink_rgb(image, max_long_side))
     }
 
+    /// [`Photograph::decode_gray`] and [`Photograph::decode_rgb`] from one reading of the file.
+    ///
+    /// # Errors
+    /// When the pixels can't be decoded.
+    pub fn decode_gray_and_rgb(
+        &self,
+        max_long_side_gray: Option<u32>,
+        max_long_side_rgb: Option<u32>,
+    ) -> Result<(Decoded<GrayImage>, Decoded<RgbImage>), PhotographError> {
+        let (gray, rgb) = guarded(|| match self.info.format {
+            PhotographFormat::Jpeg => jpeg::decode_gray_and_rgb(self.bytes, max_long_side_rgb),
+            _ => {
+                let image = self.decode_dynamic()?;
+                Ok((convert::to_gray(&image), convert::shrink_rgb(convert::to_rgb(&image), max_long_side_rgb)))
+            }
+        })?;
+        Ok((convert::shrink_gray(gray, max_long_side_gray), rgb))
+    }
+
     fn decode_dynamic(&self) -> Result<DynamicImage, PhotographError> {
         let pixels = u64::from(self.info.width) * u64::from(self.info.height);
         let decoder = decoder(self.bytes, self.info.format, MAX_HEADER_BYTES + MAX_DECODED_BYTES_PER_PIXEL * pixels)?;
