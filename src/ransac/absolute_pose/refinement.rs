@@ -92,28 +92,23 @@ impl PlacedCamera {
     }
 }
 
-fn has_k1(camera: &Camera) -> bool {
-    camera.model.distortion_index() < camera.model.num_params()
-}
-
-/// The camera with the least robust cost near `start`.
-pub(super) fn refine(start: PlacedCamera, data: &[(Vector3<f64>, Pixel)], free: Free, loss_px: f64) -> PlacedCamera {
-    let c_sq = loss_px * loss_px;
-    let held = [(LOG_FOCAL, !free.focal), (K1, !(free.k1 && has_k1(&start.camera)))];
-    let mut at = start;
-    let mut cost = at.cost(data, loss_px);
-    let mut damping = INITIAL_DAMPING;
-    let mut steps = 0;
-    while steps < MAX_STEPS && damping < MAX_DAMPING && cost.is_finite() {
+impl PlacedCamera {
+    /// The reweighted normal equations, with the rows and columns of what is held those of the identity.
+    fn normal_equations(
+        &self,
+        data: &[(Vector3<f64>, Pixel)],
+        free: Free,
+        c_sq: f64,
+    ) -> (SMatrix<f64, PARAMETERS, PARAMETERS>, SVector<f64, PARAMETERS>) {
         let mut hessian = SMatrix::<f64, PARAMETERS, PARAMETERS>::zeros();
         let mut gradient = SVector::<f64, PARAMETERS>::zeros();
         for (point, pixel) in data {
-            let Some((residual, jacobian)) = at.linearize(point, pixel) else { continue };
+            let Some((residual, jacobian)) = self.linearize(point, pixel) else { continue };
             let weight = 1.0 / (1.0 + residual.norm_squared() / c_sq);
             hessian += jacobian.transpose() * jacobian * weight;
             gradient += jacobian.transpose() * residual * weight;
         }
-        for (parameter, hold) in held {
+        for (parameter, hold) in [(LOG_FOCAL, !free.focal), (K1, !(free.k1 && has_k1(&self.camera)))] {
             if hold {
                 hessian.row_mut(parameter).fill(0.0);
                 hessian.column_mut(parameter).fill(0.0);
@@ -121,6 +116,30 @@ pub(super) fn refine(start: PlacedCamera, data: &[(Vector3<f64>, Pixel)], free: 
                 gradient[parameter] = 0.0;
             }
         }
+        (hessian, gradient)
+    }
+
+    /// The change of the logarithm of the focal length in the first undamped step with pose and focal length free: near the
+    /// least cost, all of the change there will be. None where the matches do not determine it.
+    pub fn focal_pull(&self, data: &[(Vector3<f64>, Pixel)], loss_px: f64) -> Option<f64> {
+        let (hessian, gradient) = self.normal_equations(data, Free { focal: true, k1: false }, loss_px * loss_px);
+        Some(-hessian.cholesky()?.solve(&gradient)[LOG_FOCAL])
+    }
+}
+
+fn has_k1(camera: &Camera) -> bool {
+    camera.model.distortion_index() < camera.model.num_params()
+}
+
+/// The camera with the least robust cost near `start`.
+pub(super) fn refine(start: PlacedCamera, data: &[(Vector3<f64>, Pixel)], free: Free, loss_px: f64) -> PlacedCamera {
+    let c_sq = loss_px * loss_px;
+    let mut at = start;
+    let mut cost = at.cost(data, loss_px);
+    let mut damping = INITIAL_DAMPING;
+    let mut steps = 0;
+    while steps < MAX_STEPS && damping < MAX_DAMPING && cost.is_finite() {
+        let (hessian, gradient) = at.normal_equations(data, free, c_sq);
         let mut improved = false;
         while steps < MAX_STEPS && damping < MAX_DAMPING && !improved {
             steps += 1;
