@@ -49,6 +49,33 @@ impl Default for AccessPolicy {
     }
 }
 
+/// How patient the service is with the other end of a connection.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ConnectionLimits {
+    /// Connections open at once. When all places are taken, the one that has waited longest for a request makes room.
+    pub max_connections: usize,
+    /// Time for the head of a request, and for the next request of an idle connection.
+    pub header_timeout: Duration,
+    /// Time over which the rate of a request's body is taken.
+    pub body_window: Duration,
+    /// A body that brings less per second of waiting, over a window, is given up.
+    pub min_body_bytes_per_s: u64,
+    /// A reader that takes no byte of an answer for so long is given up.
+    pub write_stall: Duration,
+}
+
+impl Default for ConnectionLimits {
+    fn default() -> Self {
+        Self {
+            max_connections: 4096,
+            header_timeout: Duration::from_secs(30),
+            body_window: Duration::from_secs(30),
+            min_body_bytes_per_s: 128,
+            write_stall: Duration::from_secs(60),
+        }
+    }
+}
+
 /// Settings of `multistage serve`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ServerConfig {
@@ -66,6 +93,8 @@ pub struct ServerConfig {
     pub access: AccessPolicy,
     /// What uploads may bring.
     pub uploads: UploadLimits,
+    /// How slow the other end may be.
+    pub connections: ConnectionLimits,
     /// Time for a request other than uploads, downloads and event streams.
     pub request_timeout: Duration,
     /// An upload that brings no byte for so long is given up.
@@ -91,8 +120,9 @@ impl ServerConfig {
             seed: 0,
             access: AccessPolicy::default(),
             uploads: UploadLimits::default(),
+            connections: ConnectionLimits::default(),
             request_timeout: Duration::from_secs(30),
-            upload_idle_timeout: Duration::from_secs(60),
+            upload_idle_timeout: Duration::from_secs(30),
             upload_expiry: Duration::from_secs(7 * 24 * 3600),
             upload_lock_wait: Duration::from_secs(10),
             keep_alive: Duration::from_secs(15),

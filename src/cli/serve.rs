@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::ValueEnum;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::signal::unix::{SignalKind, signal};
 use tracing_subscriber::EnvFilter;
 
@@ -43,6 +44,9 @@ pub(super) struct Args {
     /// Jobs that run at once; each has its own threads and memory.
     #[arg(long, env = "MULTISTAGE_MAX_PARALLEL_JOBS", default_value = "1")]
     max_parallel_jobs: NonZeroUsize,
+    /// Connections open at once [default: 4096, or what the system's limit on open files allows].
+    #[arg(long, env = "MULTISTAGE_MAX_CONNECTIONS")]
+    max_connections: Option<NonZeroUsize>,
     /// Bytes that one upload may bring [default: 256 GiB].
     #[arg(long, env = "MULTISTAGE_MAX_UPLOAD_BYTES")]
     max_upload_bytes: Option<NonZeroU64>,
@@ -72,6 +76,9 @@ impl Args {
         config.threads = self.threads.map_or(config.threads, NonZeroUsize::get);
         config.parallel_jobs = self.max_parallel_jobs.get();
         config.seed = self.seed;
+        let connections = &mut config.connections;
+        let wanted = self.max_connections.map_or(connections.max_connections, NonZeroUsize::get);
+        connections.max_connections = wanted.min(connections_that_fit());
         let access = &mut config.access;
         access.token_required = self.require_token || !(self.insecure || self.bind.ip().is_loopback());
         access.cors_origins.clone_from(&self.cors_origins);
@@ -82,6 +89,22 @@ impl Args {
         uploads.max_files = self.max_files.map_or(uploads.max_files, NonZeroUsize::get);
         config
     }
+}
+
+/// Open files that the database, uploads, downloads and jobs need besides connections.
+const OTHER_FILES: u64 = 512;
+
+/// Raises the process's limit on open files as far as the system lets it, and gives the connections that fit below it.
+fn connections_that_fit() -> usize {
+    let mut limit = getrlimit(Resource::Nofile);
+    let raised = Rlimit { current: limit.maximum, ..limit };
+    if setrlimit(Resource::Nofile, raised).is_ok() {
+        limit = raised;
+    }
+    limit.current.map_or(usize::MAX, |files| {
+        // With few files, half of them.
+        usize::try_from(files.saturating_sub(OTHER_FILES).max(files / 2)).unwrap_or(usize::MAX)
+    })
 }
 
 /// Runs the service.

@@ -1,6 +1,7 @@
 //! The web service: a router over the job queue and the store. `openapi.yaml` is its contract.
 
 mod access;
+mod connection;
 mod download;
 mod extract;
 mod metrics;

@@ -9,7 +9,7 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
-use super::{AppState, router};
+use super::{AppState, connection, router};
 use crate::config::ServerConfig;
 use crate::jobs::{Engine, Executor, Hub, Jobs, recover};
 use crate::store::{Store, StoreError};
@@ -43,7 +43,7 @@ pub struct Server {
     /// Where it listens.
     pub address: SocketAddr,
     shutdown: CancellationToken,
-    listener: JoinHandle<io::Result<()>>,
+    listener: JoinHandle<()>,
     executor: JoinHandle<()>,
     grace: Duration,
     store: Arc<Store>,
@@ -68,10 +68,9 @@ impl Server {
         let executor = tokio::spawn(executor.run(config.parallel_jobs, shutdown.clone()));
         tokio::spawn(sweep(Arc::clone(&store), shutdown.clone()));
         let grace = config.shutdown_grace;
+        let limits = config.connections;
         let app = router(AppState::new(jobs, config, shutdown.clone()));
-        let app = app.into_make_service_with_connect_info::<SocketAddr>();
-        let stop = shutdown.clone().cancelled_owned();
-        let listener = tokio::spawn(async move { axum::serve(listener, app).with_graceful_shutdown(stop).await });
+        let listener = tokio::spawn(connection::serve(listener, app, limits, shutdown.clone()));
         Ok(Self { address, shutdown, listener, executor, grace, store })
     }
 
@@ -80,7 +79,7 @@ impl Server {
         self.shutdown.cancel();
         let ended = tokio::time::timeout(self.grace, async {
             let (listener, executor) = tokio::join!(&mut self.listener, &mut self.executor);
-            if let Err(error) = listener.map_err(io::Error::other).and_then(|result| result) {
+            if let Err(error) = listener {
                 tracing::error!(%error, "the listener ended with an error");
             }
             if let Err(error) = executor {
