@@ -87,6 +87,8 @@ pub struct ServerConfig {
     pub threads: usize,
     /// Jobs that run at once.
     pub parallel_jobs: usize,
+    /// Jobs that ended, and datasets that nothing used, are removed after so long; none for never.
+    pub keep: Option<Duration>,
     /// Seed of every job's run.
     pub seed: u64,
     /// Who may use it.
@@ -117,6 +119,7 @@ impl ServerConfig {
             data_dir: data_dir.to_path_buf(),
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             parallel_jobs: 1,
+            keep: None,
             seed: 0,
             access: AccessPolicy::default(),
             uploads: UploadLimits::default(),

@@ -18,3 +18,5 @@ mod jobs;
 mod outputs;
 #[path = "service/page.rs"]
 mod page;
+#[path = "service/queue.rs"]
+mod queue;

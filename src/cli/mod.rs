@@ -3,6 +3,7 @@
 //! Exit status: 0 done (for `reconstruct`: a model was made); 1 something outside failed, such as a full disk; 2 bad
 //! arguments or input; 3 the photographs gave no model; 130 interrupted.
 
+mod cleanup;
 mod demo;
 mod evaluate;
 mod model_poses;
@@ -30,6 +31,8 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Remove what nobody has used for long.
+    Cleanup(cleanup::Args),
     /// Make a model of the photographs in a folder.
     Reconstruct(reconstruct::Args),
     /// Photograph a synthetic temple, reconstruct it by the service, and keep serving.
@@ -71,6 +74,7 @@ impl Failure {
 /// Parses the arguments, runs the command, and says how it went.
 pub fn run() -> ExitCode {
     let result = match Cli::parse().command {
+        Command::Cleanup(args) => cleanup::run(&args),
         Command::Reconstruct(args) => reconstruct::run(args),
         Command::Demo(args) => demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),

@@ -44,6 +44,9 @@ pub(super) struct Args {
     /// Jobs that run at once; each has its own threads and memory.
     #[arg(long, env = "MULTISTAGE_MAX_PARALLEL_JOBS", default_value = "1")]
     max_parallel_jobs: NonZeroUsize,
+    /// Remove jobs so many days after their end, and datasets that nothing has used for as long [default: keep everything].
+    #[arg(long, env = "MULTISTAGE_KEEP_DAYS")]
+    keep_days: Option<u32>,
     /// Connections open at once [default: 4096, or what the system's limit on open files allows].
     #[arg(long, env = "MULTISTAGE_MAX_CONNECTIONS")]
     max_connections: Option<NonZeroUsize>,
@@ -75,6 +78,7 @@ impl Args {
         config.bind = self.bind;
         config.threads = self.threads.map_or(config.threads, NonZeroUsize::get);
         config.parallel_jobs = self.max_parallel_jobs.get();
+        config.keep = self.keep_days.map(|days| Duration::from_secs(24 * 3600 * u64::from(days)));
         config.seed = self.seed;
         let connections = &mut config.connections;
         let wanted = self.max_connections.map_or(connections.max_connections, NonZeroUsize::get);

@@ -7,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
 use crate::jobs::JobsError;
-use crate::store::{ArchiveError, InvalidFileName, StoreError, UploadError};
+use crate::store::{ArchiveError, InvalidFileName, Quantity, StoreError, UploadError};
 
 /// Defines the codes with their status, in the order of `openapi.yaml`.
 macro_rules! codes {
@@ -46,6 +46,9 @@ codes! {
     UploadFinal "upload_final" 403,
     Forbidden "forbidden" 403,
     CrossSite "cross_site" 403,
+    BytesQuotaExceeded "bytes_quota_exceeded" 403,
+    ImagesQuotaExceeded "images_quota_exceeded" 403,
+    JobsQuotaExceeded "jobs_quota_exceeded" 403,
     NotFound "not_found" 404,
     JobNotFound "job_not_found" 404,
     DatasetNotFound "dataset_not_found" 404,
@@ -59,6 +62,7 @@ codes! {
     JobRunning "job_running" 409,
     JobNotActive "job_not_active" 409,
     JobNotResumable "job_not_resumable" 409,
+    JobNotQueued "job_not_queued" 409,
     OffsetMismatch "offset_mismatch" 409,
     UploadExpired "upload_expired" 410,
     UnsupportedTusVersion "unsupported_tus_version" 412,
@@ -71,6 +75,7 @@ codes! {
     InvalidArchive "invalid_archive" 422,
     InvalidName "invalid_name" 422,
     InvalidOptions "invalid_options" 422,
+    InvalidPriority "invalid_priority" 422,
     NoImages "no_images" 422,
     ThumbnailUnavailable "thumbnail_unavailable" 422,
     UploadConflict "upload_conflict" 422,
@@ -197,6 +202,12 @@ impl From<StoreError> for Problem {
             StoreError::FileConflict(path) => {
                 Self::new(Code::FileConflict).detail("the path is stored already with other bytes").path(path)
             }
+            StoreError::QuotaExceeded { quantity, .. } => Self::new(match quantity {
+                Quantity::Bytes => Code::BytesQuotaExceeded,
+                Quantity::Images => Code::ImagesQuotaExceeded,
+                Quantity::Jobs => Code::JobsQuotaExceeded,
+            })
+            .detail(error),
             StoreError::DatasetInUse => Self::new(Code::DatasetInUse).detail(error),
             StoreError::NotFound => Self::new(Code::DatasetNotFound),
             StoreError::Io(_) | StoreError::Db(_) => Self::internal(&error),
@@ -227,6 +238,8 @@ impl From<JobsError> for Problem {
             JobsError::DatasetNotFound => Code::DatasetNotFound,
             JobsError::NoImages => Code::NoImages,
             JobsError::InvalidName => Code::InvalidName,
+            JobsError::InvalidPriority => Code::InvalidPriority,
+            JobsError::NotQueued(_) => Code::JobNotQueued,
             JobsError::Running => Code::JobRunning,
             JobsError::NotActive(_) => Code::JobNotActive,
             JobsError::NotResumable(_) => Code::JobNotResumable,

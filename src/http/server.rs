@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{AppState, connection, router};
 use crate::config::ServerConfig;
-use crate::jobs::{Engine, Executor, Hub, Jobs, recover};
+use crate::jobs::{Engine, Executor, Hub, Jobs, recover, remove_stale};
 use crate::store::{Store, StoreError};
 
 /// Between two looks for uploads whose time is over.
@@ -66,7 +66,7 @@ impl Server {
         let shutdown = CancellationToken::new();
         let executor = Executor { jobs: jobs.clone(), threads: config.threads, seed: config.seed };
         let executor = tokio::spawn(executor.run(config.parallel_jobs, shutdown.clone()));
-        tokio::spawn(sweep(Arc::clone(&store), shutdown.clone()));
+        tokio::spawn(sweep(Arc::clone(&store), config.keep, shutdown.clone()));
         let grace = config.shutdown_grace;
         let limits = config.connections;
         let app = router(AppState::new(jobs, config, shutdown.clone()));
@@ -96,9 +96,20 @@ impl Server {
     }
 }
 
-/// Removes uploads whose time is over, from the start on and now and then.
-async fn sweep(store: Arc<Store>, shutdown: CancellationToken) {
+/// Removes what its time is over for, from the start on and now and then.
+async fn sweep(store: Arc<Store>, keep: Option<Duration>, shutdown: CancellationToken) {
     loop {
+        if let Some(keep) = keep {
+            match remove_stale(&store.db, keep).await {
+                Ok(stale) if stale.is_empty() => {}
+                Ok(stale) => tracing::info!(?stale, "jobs and datasets were kept long enough and are removed"),
+                Err(error) => tracing::warn!(%error, "what was kept long enough could not be removed"),
+            }
+        }
+        // What `multistage cleanup` noted goes, too.
+        if let Err(error) = store.discard_deleted().await {
+            tracing::warn!(%error, "deleted folders could not be removed");
+        }
         match store.sweep_uploads().await {
             Ok(0) => {}
             Ok(expired) => tracing::info!(expired, "uploads expired"),

@@ -47,6 +47,8 @@ pub(super) struct Received {
     pub(super) name: Option<String>,
     /// The `options` part.
     pub(super) options: Option<String>,
+    /// The `priority` part.
+    pub(super) priority: Option<String>,
 }
 
 impl Received {
@@ -158,6 +160,7 @@ async fn receive_parts(
             "images" => intake.photograph(field).await?,
             "archive" => intake.archive(field).await?,
             "name" if with_text => intake.received.name = Some(intake.text(field).await?),
+            "priority" if with_text => intake.received.priority = Some(intake.text(field).await?),
             "options" if with_text => intake.received.options = Some(intake.text(field).await?),
             other => {
                 let message = format!("no part {other:?} is known here");

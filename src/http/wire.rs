@@ -5,7 +5,7 @@ use uuid::Uuid;
 
 use crate::formats::report::ImageReport;
 use crate::jobs::view::{CurrentStage, ErrorView, ModelSummary, StageView, time_text};
-use crate::jobs::{Eta, JobState, estimate, state_of};
+use crate::jobs::{Eta, JobState, QueuePlace, estimate, state_of};
 use crate::store::db::dataset_images::DatasetImageRow;
 use crate::store::db::datasets::DatasetRow;
 use crate::store::db::job_images::{JobImageCounts, JobImageRow};
@@ -37,6 +37,8 @@ pub(super) struct Job {
     finished_at: Option<String>,
     dataset_id: String,
     options: serde_json::Value,
+    priority: i64,
+    queue: Option<QueuePlace>,
     images: ImageCounts,
     stage: Option<CurrentStage>,
     stages: Vec<StageView>,
@@ -83,7 +85,8 @@ struct JobLinks {
 }
 
 impl Job {
-    pub(super) fn new(row: JobRow, stages: &[JobStageRow], images: JobImageCounts) -> Self {
+    /// `place` is where a waiting job stands.
+    pub(super) fn new(row: JobRow, stages: &[JobStageRow], images: JobImageCounts, place: Option<QueuePlace>) -> Self {
         let state = state_of(&row);
         let running = state == JobState::Running;
         let models: Option<Vec<ModelSummary>> = row.models.as_deref().and_then(|json| serde_json::from_str(json).ok());
@@ -105,7 +108,9 @@ impl Job {
             },
             stage: if running { CurrentStage::among(stages) } else { None },
             stages: stages.iter().map(StageView::of).collect(),
-            eta_s: if running { estimate(stages, now_ms()) } else { None },
+            priority: row.priority,
+            queue: place,
+            eta_s: if running { estimate(stages, now_ms()) } else { place.and_then(|place| place.done_in_s) },
             error: ErrorView::of(&row),
             models: models
                 .unwrap_or_default()

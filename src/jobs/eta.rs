@@ -42,6 +42,13 @@ pub struct Eta {
     pub high: f64,
 }
 
+impl Eta {
+    /// One after the other.
+    pub fn plus(self, other: Self) -> Self {
+        Self { low: self.low + other.low, high: self.high + other.high }
+    }
+}
+
 fn weight(stage: &JobStageRow) -> f64 {
     let known = WEIGHTS.iter().find(|(name, _)| *name == stage.name);
     let weight = known.map_or(UNKNOWN_WEIGHT, |(_, weight)| *weight);

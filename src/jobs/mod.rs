@@ -11,6 +11,8 @@ mod progress;
 mod publish;
 mod queue;
 mod recovery;
+mod retention;
+mod schedule;
 mod state;
 pub mod view;
 
@@ -18,6 +20,8 @@ pub use engine::{Engine, PipelineEngine};
 pub use eta::{Eta, estimate};
 pub use executor::{Executor, Tick};
 pub use hub::Hub;
-pub use queue::{Jobs, JobsError, MAX_NAME_CHARS, NewJob, state_of};
+pub use queue::{Jobs, JobsError, MAX_NAME_CHARS, MAX_PRIORITY, NewJob, state_of};
 pub use recovery::{Recovered, recover};
+pub use retention::{Stale, find_stale, remove_stale};
+pub use schedule::QueuePlace;
 pub use state::JobState;

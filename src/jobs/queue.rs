@@ -1,19 +1,26 @@
 //! What may be done with jobs from outside: enqueue, cancel, resume, delete. Every move is one transaction, and each change of
 //! state is an event.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use sqlx::SqliteConnection;
 use uuid::Uuid;
 
+use super::eta::{Eta, estimate};
+use super::schedule::{self, QueuePlace, Rates, Size, Turns, Waiting};
 use super::view::{ErrorView, StateEvent, time_text};
 use super::{Engine, Hub, JobState};
-use crate::store::db::jobs::{JobRow, NewJobRow};
+use crate::store::db::jobs::{JobRow, NewJobRow, QueuedRow};
 use crate::store::db::{dataset_images, datasets, job_events, job_images, job_outputs, job_stages, jobs, now_ms};
-use crate::store::{Store, StoreError};
+use crate::store::{Quantity, Store, StoreError, check_quota};
 
 /// Letters of a job's name.
 pub const MAX_NAME_CHARS: usize = 200;
+/// The highest priority; the lowest is as far below 0.
+pub const MAX_PRIORITY: i64 = 10;
+/// Runs that a forecast goes by.
+const RATED_RUNS: u32 = 20;
 
 /// The jobs of a store.
 #[derive(Clone)]
@@ -39,6 +46,8 @@ pub struct NewJob {
     pub options: serde_json::Value,
     /// Files of its own upload that were no photographs.
     pub ignored: Option<usize>,
+    /// Of two waiting jobs the one of higher priority starts first.
+    pub priority: i64,
     /// The token it belongs to.
     pub owner_token: Option<Uuid>,
 }
@@ -58,6 +67,9 @@ pub enum JobsError {
     /// The name is too long.
     #[error("a name has at most {MAX_NAME_CHARS} letters")]
     InvalidName,
+    /// The priority is out of bounds.
+    #[error("a priority is from -{MAX_PRIORITY} to {MAX_PRIORITY}")]
+    InvalidPriority,
     /// The engine refuses the options.
     #[error("invalid options: {}", .0.join("; "))]
     InvalidOptions(Vec<String>),
@@ -67,6 +79,9 @@ pub enum JobsError {
     /// It is over.
     #[error("the job is over: {0}")]
     NotActive(JobState),
+    /// It does not wait any more.
+    #[error("only the priority of a waiting job can be changed; this one is {0}")]
+    NotQueued(JobState),
     /// It is not over, or succeeded.
     #[error("only a failed or cancelled job can be resumed; this one is {0}")]
     NotResumable(JobState),
@@ -119,6 +134,48 @@ pub(super) async fn transition(
     Ok(())
 }
 
+fn check_priority(priority: i64) -> Result<(), JobsError> {
+    if (-MAX_PRIORITY..=MAX_PRIORITY).contains(&priority) { Ok(()) } else { Err(JobsError::InvalidPriority) }
+}
+
+fn size(row: &QueuedRow) -> Size {
+    Size { images: row.images as f64, bytes: row.size_bytes as f64 }
+}
+
+/// The waiting jobs in the order in which they will start.
+async fn ordered_queue(db: &mut SqliteConnection) -> Result<Vec<Waiting>, StoreError> {
+    let waiting = jobs::queue(&mut *db, "queued").await?.into_iter().map(|row| Waiting {
+        size: size(&row),
+        id: row.id,
+        owner: row.owner_token,
+        priority: row.priority,
+        seq: row.seq,
+    });
+    let waiting: Vec<Waiting> = waiting.collect();
+    if waiting.is_empty() {
+        return Ok(waiting);
+    }
+    let turns = jobs::turns(&mut *db).await?.into_iter().map(|(owner, running, last_ms)| {
+        let turns = Turns { running: usize::try_from(running).unwrap_or(0), last_ms };
+        (owner, turns)
+    });
+    Ok(schedule::order(waiting, &turns.collect()))
+}
+
+/// Removes the rows of a job that does not run, and its dataset when its own upload made it and no other job uses it; gives that
+/// dataset.
+pub(super) async fn remove_job(tx: &mut SqliteConnection, id: Uuid) -> Result<Option<Uuid>, StoreError> {
+    let own: Option<Uuid> = datasets::owned_only_by(&mut *tx, id).await?.and_then(|dataset| dataset.parse().ok());
+    jobs::delete(&mut *tx, id).await?;
+    match own {
+        Some(dataset) => {
+            datasets::delete(tx, dataset).await?;
+        }
+        None => datasets::release_owner(tx, id).await?,
+    }
+    Ok(own)
+}
+
 impl Jobs {
     /// One job.
     ///
@@ -145,6 +202,7 @@ impl Jobs {
     /// Why not.
     pub async fn enqueue(&self, new: NewJob) -> Result<JobRow, JobsError> {
         self.check(&new.name, &new.options)?;
+        check_priority(new.priority)?;
         let mut tx = self.store.db.write().await?;
         let Some(dataset) = datasets::find(&mut *tx, new.dataset).await? else {
             return Err(JobsError::DatasetNotFound);
@@ -160,9 +218,12 @@ impl Jobs {
             dataset: new.dataset,
             options: new.options.to_string(),
             ignored: new.ignored.map(|n| i64::try_from(n).unwrap_or(i64::MAX)),
+            priority: new.priority,
             owner_token: new.owner_token,
         };
         jobs::insert(&mut tx, &row).await?;
+        let owner = new.owner_token.map(|token| token.to_string());
+        check_quota(&mut tx, owner.as_deref(), &[Quantity::Jobs]).await?;
         job_images::freeze(&mut tx, new.id, new.dataset).await?;
         let event = StateEvent { state: JobState::Queued, at: time_text(now), error: None };
         let data = serde_json::to_string(&event).map_err(|error| sqlx::Error::Encode(error.into()))?;
@@ -174,15 +235,74 @@ impl Jobs {
         Ok(row)
     }
 
-    /// Takes the job that has waited longest out of the queue and marks it running.
+    /// Takes the job whose turn it is out of the queue and marks it running.
     pub(super) async fn claim(&self) -> Result<Option<JobRow>, StoreError> {
         let mut tx = self.store.db.write().await?;
-        let Some(mut row) = jobs::next_queued(&mut tx).await? else { return Ok(None) };
+        let ordered = ordered_queue(&mut tx).await?;
+        let Some(next) = ordered.first().and_then(|job| job.id.parse().ok()) else { return Ok(None) };
+        let Some(mut row) = jobs::find(&mut *tx, next).await? else { return Ok(None) };
         job_stages::clear(&mut tx, job_id(&row)?).await?;
         transition(&mut tx, &mut row, JobState::Running, None).await?;
         tx.commit().await?;
         self.hub.announce();
         Ok(Some(row))
+    }
+
+    /// Where every waiting job stands, by its id, when `lanes` jobs run at once.
+    ///
+    /// # Errors
+    /// What the store said.
+    pub async fn places(&self, lanes: usize) -> Result<BTreeMap<String, QueuePlace>, StoreError> {
+        let mut snapshot = self.store.db.reader().begin().await?;
+        let ordered = ordered_queue(&mut snapshot).await?;
+        if ordered.is_empty() {
+            return Ok(BTreeMap::new());
+        }
+        let now = now_ms();
+        let mut rates = Rates::default();
+        for run in jobs::latest_whole_runs(&mut *snapshot, RATED_RUNS).await? {
+            let seconds = run.finished_ms.zip(run.started_ms).map_or(0, |(end, start)| end - start) as f64 / 1000.0;
+            rates.add(size(&run), Eta { low: seconds, high: seconds });
+        }
+        let mut running = Vec::new();
+        for run in jobs::queue(&mut *snapshot, "running").await? {
+            let id = run.id.parse().map_err(|_| StoreError::NotFound)?;
+            let stages = job_stages::list(&mut *snapshot, id).await?;
+            let left = estimate(&stages, now);
+            let spent_s = run.started_ms.map_or(0, |start| (now - start).max(0)) as f64 / 1000.0;
+            if let Some(left) = left
+                && stages.iter().all(|stage| stage.state != "reused")
+            {
+                rates.add(size(&run), left.plus(Eta { low: spent_s, high: spent_s }));
+            }
+            // Until it tells itself, as for those that wait.
+            let forecast = || {
+                let all = rates.forecast(size(&run))?;
+                Some(Eta { low: (all.low - spent_s).max(0.0), high: (all.high - spent_s).max(0.0) })
+            };
+            running.push(left.or_else(forecast));
+        }
+        let places = schedule::places(&ordered, lanes, &running, &rates);
+        Ok(ordered.into_iter().map(|job| job.id).zip(places).collect())
+    }
+
+    /// Moves a waiting job forward or back.
+    ///
+    /// # Errors
+    /// [`JobsError::NotQueued`] in any other state.
+    pub async fn set_priority(&self, id: Uuid, priority: i64) -> Result<JobRow, JobsError> {
+        check_priority(priority)?;
+        let mut tx = self.store.db.write().await?;
+        let mut row = jobs::find(&mut *tx, id).await?.ok_or(JobsError::JobNotFound)?;
+        let state = state_of(&row);
+        if state != JobState::Queued {
+            return Err(JobsError::NotQueued(state));
+        }
+        row.priority = priority;
+        jobs::update_state(&mut tx, &row).await?;
+        tx.commit().await?;
+        self.hub.announce();
+        Ok(row)
     }
 
     /// Stops a queued job at once, asks a running one to stop; no error for one that is cancelled.
@@ -243,14 +363,7 @@ impl Jobs {
         if state_of(&row) == JobState::Running {
             return Err(JobsError::Running);
         }
-        let own: Option<Uuid> = datasets::owned_only_by(&mut tx, id).await?.and_then(|dataset| dataset.parse().ok());
-        jobs::delete(&mut tx, id).await?;
-        match own {
-            Some(dataset) => {
-                datasets::delete(&mut tx, dataset).await?;
-            }
-            None => datasets::release_owner(&mut tx, id).await?,
-        }
+        remove_job(&mut tx, id).await?;
         tx.commit().await?;
         self.hub.announce();
         Ok(self.store.discard_deleted().await?)

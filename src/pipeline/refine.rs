@@ -1,14 +1,23 @@
 //! The last adjustment: everything free that the photographs determine, then filtering, a few rounds.
 
 use super::options::ReconstructionOptions;
+use super::{Context, PipelineError};
 use crate::add_points::remove_strays;
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
 use crate::coarse::{KeepLimits, filter, free_intrinsics, merge_agreeing_cameras};
 use crate::scene::{Point3dId, Reconstruction};
 
 /// Refines a model in place.
-pub fn refine(model: &mut Reconstruction, options: &ReconstructionOptions) {
+///
+/// # Errors
+/// Cancellation, asked for before every round.
+pub fn refine(
+    model: &mut Reconstruction,
+    options: &ReconstructionOptions,
+    context: &Context,
+) -> Result<(), PipelineError> {
     for _ in 0..options.refine.rounds {
+        context.check_cancelled()?;
         merge_agreeing_cameras(model, &options.coarse.mapper.intrinsics);
         let mut config = BundleConfig::global(model, FreeIntrinsics::default());
         config.intrinsics = free_intrinsics(model, &options.coarse.mapper.intrinsics);
@@ -21,4 +30,5 @@ pub fn refine(model: &mut Reconstruction, options: &ReconstructionOptions) {
         }
     }
     remove_strays(model, &options.refine.strays);
+    Ok(())
 }

@@ -133,8 +133,7 @@ impl Pipeline<'_> {
                     let mut state = before;
                     let points_before: usize = state.models.iter().map(|account| account.model.num_points()).sum();
                     for account in &mut state.models {
-                        context.check_cancelled()?;
-                        refine::refine(&mut account.model, options);
+                        refine::refine(&mut account.model, options, context)?;
                         progress.tick();
                     }
                     let points: usize = state.models.iter().map(|account| account.model.num_points()).sum();

@@ -56,9 +56,7 @@ impl ImagePath {
         if name.contains('\\') {
             return Err(InvalidFileName::Backslash);
         }
-        let mut letters = name.chars();
-        let drive = letters.next().is_some_and(|c| c.is_ascii_alphabetic()) && letters.next() == Some(':');
-        if name.starts_with('/') || drive {
+        if name.starts_with('/') {
             return Err(InvalidFileName::Absolute);
         }
         let parts: Vec<&str> = name.split('/').filter(|part| !part.is_empty() && *part != ".").collect();
@@ -69,6 +67,11 @@ impl ImagePath {
             return Err(InvalidFileName::TooLong);
         }
         let path = parts.join("/");
+        // Once the dots are gone: `./c:a.jpg` names a drive, too.
+        let mut letters = path.chars();
+        if letters.next().is_some_and(|c| c.is_ascii_alphabetic()) && letters.next() == Some(':') {
+            return Err(InvalidFileName::Absolute);
+        }
         match path.len() {
             0 => Err(InvalidFileName::Empty),
             1..=MAX_NAME_BYTES => Ok(Self(path)),
@@ -126,6 +129,7 @@ mod tests {
             ("/etc/passwd", Absolute),
             ("C:/a.jpg", Absolute),
             ("c:a.jpg", Absolute),
+            (".//c:a.jpg", Absolute),
             ("a\\..\\b.jpg", Backslash),
             ("a\0.jpg", Control),
             ("a\n.jpg", Control),

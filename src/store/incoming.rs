@@ -14,8 +14,9 @@ use tempfile::{NamedTempFile, TempPath};
 use uuid::Uuid;
 
 use super::db::dataset_images::DatasetImageRow;
-use super::db::{dataset_images, datasets, jobs};
-use super::{ImagePath, Store, StoreError, atomic};
+use super::db::tokens::{self, Owned};
+use super::db::{dataset_images, datasets, jobs, now_ms};
+use super::{ImagePath, Quantity, Store, StoreError, atomic, check_quota};
 
 /// A file that is being staged. Blocking: use it off the async threads.
 pub struct StagedWriter {
@@ -155,6 +156,11 @@ impl Store {
                     new.push(file);
                 }
             }
+        }
+        if committed.stored > 0 {
+            datasets::touch(tx, dataset, now_ms()).await?;
+            let owner = tokens::owner(&mut *tx, Owned::Dataset(dataset)).await?.flatten();
+            check_quota(tx, owner.as_deref(), &[Quantity::Bytes, Quantity::Images]).await?;
         }
         let folder = self.data.images(dataset);
         let root = self.data.root().to_path_buf();

@@ -117,6 +117,15 @@ impl DataDir {
         self.root.join("incoming")
     }
 
+    /// What the files below a folder take; a missing one takes nothing.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub fn folder_bytes(folder: &Path) -> io::Result<u64> {
+        let sizes = atomic::list_files(folder)?.into_iter().map(|path| Ok(folder.join(path).metadata()?.len()));
+        sizes.sum()
+    }
+
     /// Deletes a folder so that it is gone at once, whatever happens while its content is removed; a missing one is no error.
     pub(crate) fn discard(&self, folder: &Path) -> io::Result<()> {
         let grave = self.root.join("trash").join(Uuid::now_v7().to_string());

@@ -7,6 +7,7 @@ pub mod db;
 mod file_name;
 mod incoming;
 mod layout;
+mod quota;
 mod resumable;
 mod token;
 
@@ -19,6 +20,8 @@ pub use db::Db;
 pub use file_name::{ImagePath, InvalidFileName};
 pub use incoming::{Committed, StagedFile, StagedWriter};
 pub use layout::DataDir;
+pub(crate) use quota::check as check_quota;
+pub use quota::{Quantity, Quota};
 pub use resumable::{Appender, NewUpload, UploadError, UploadKind};
 pub use token::{Scope, create_token, find_token};
 
@@ -43,6 +46,16 @@ pub enum StoreError {
     /// A job on the dataset is queued or running.
     #[error("a job uses the dataset")]
     DatasetInUse,
+    /// The token that it belongs to may not keep so much.
+    #[error("the token may keep {limit} {what}; this would make {wanted}", what = .quantity.as_str())]
+    QuotaExceeded {
+        /// Of what.
+        quantity: Quantity,
+        /// How much it may keep.
+        limit: u64,
+        /// How much it would be.
+        wanted: u64,
+    },
     /// There is no such thing.
     #[error("not found")]
     NotFound,

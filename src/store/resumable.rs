@@ -15,7 +15,7 @@ use uuid::Uuid;
 use super::db::uploads::UploadRow;
 use super::db::{dataset_images, now_ms, uploads};
 use super::incoming::{StagedFile, hex};
-use super::{ImagePath, Store, StoreError, atomic};
+use super::{ImagePath, Quantity, Store, StoreError, atomic, check_quota};
 
 /// Bytes copied at a time.
 const CHUNK_BYTES: usize = 1 << 20;
@@ -181,6 +181,7 @@ impl Store {
             owner_token: new.owner_token.map(|token| token.to_string()),
         };
         uploads::insert(tx, &row).await?;
+        check_quota(tx, row.owner_token.as_deref(), &[Quantity::Bytes, Quantity::Images]).await?;
         Ok(row)
     }
 
@@ -263,6 +264,9 @@ impl Store {
         let staged = tokio::task::spawn_blocking(move || stage(&file, &scratch, path, size_bytes));
         let staged = staged.await.map_err(io::Error::other)??;
         let mut tx = self.db.write().await?;
+        // First, so that no quota counts it twice.
+        let stored = UploadRow { stored: true, ..row.clone() };
+        uploads::update(&mut tx, &stored).await?;
         let (_, conflict) = match self.place_images(&mut tx, dataset, vec![staged]).await {
             Err(StoreError::FileConflict(path)) => return self.refuse(tx, id, path).await,
             other => other?,
@@ -270,9 +274,8 @@ impl Store {
         if let Some(path) = conflict {
             return self.refuse(tx, id, path.to_string()).await;
         }
-        row.stored = true;
-        uploads::update(&mut tx, row).await?;
         tx.commit().await?;
+        *row = stored;
         self.forget_file(id).await;
         Ok(())
     }

@@ -66,6 +66,9 @@ pub async fn create_token(db: &Db, name: &str, scopes: &[Scope]) -> Result<Strin
         scopes: scopes.join(","),
         created_ms: now_ms(),
         revoked_ms: None,
+        quota_bytes: None,
+        quota_jobs: None,
+        quota_images: None,
     };
     let mut tx = db.write().await?;
     tokens::insert(&mut tx, &row).await?;

@@ -73,7 +73,10 @@ export function stagePanel() {
     }
     overall.hidden = false;
     if (job.state === "queued") {
-      fill(overall, h("p", {}, "Waiting for its turn: jobs run one after another."));
+      const ahead = (job.queue?.position ?? 1) - 1;
+      const place = ahead > 0 ? `Waiting: ${count(ahead)} ahead` : "Waiting: next in turn";
+      const left = timeLeft(job.eta_s);
+      fill(overall, h("p", {}, left ? `${place} \u00b7 ${left}` : place));
       return;
     }
     const now = job.stage;

@@ -1,4 +1,5 @@
 //! The real program on a data directory of its own, to be killed.
+#![allow(dead_code, reason = "every test binary uses its own part")]
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;

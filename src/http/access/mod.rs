@@ -59,6 +59,14 @@ impl Principal {
         }
     }
 
+    /// Fails unless the principal may give a job this priority: to push ahead of others is for those who answer for all.
+    pub(super) fn check_priority(&self, priority: i64) -> Result<(), Problem> {
+        if priority > 0 && !self.may(Scope::Admin) {
+            return Err(Problem::new(Code::Forbidden).detail("a priority above 0 needs the scope `admin`"));
+        }
+        Ok(())
+    }
+
     /// Fails with the problem of a missing thing unless the principal may see it.
     pub(super) async fn check_sees(&self, state: &AppState, thing: Owned) -> Result<(), Problem> {
         let Some(own) = self.sees_only() else { return Ok(()) };

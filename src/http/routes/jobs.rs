@@ -1,5 +1,7 @@
 //! Jobs: make, list, look at, cancel, resume, delete.
 
+use std::collections::BTreeMap;
+
 use axum::Router;
 use axum::extract::{FromRequest, Request, State};
 use axum::http::{HeaderValue, StatusCode, header};
@@ -13,7 +15,7 @@ use crate::http::extract::{JobId, Json, Page, Query, cut, media_type};
 use crate::http::problem::{Code, Problem};
 use crate::http::upload::{Parts, Received, receive};
 use crate::http::{AppState, wire};
-use crate::jobs::{Jobs, NewJob};
+use crate::jobs::{JobState, Jobs, NewJob, QueuePlace, state_of};
 use crate::store::db::jobs::JobRow;
 use crate::store::db::tokens::Owned;
 use crate::store::db::{datasets, job_images, job_stages, jobs, now_ms};
@@ -22,7 +24,7 @@ use crate::store::db::{datasets, job_images, job_stages, jobs, now_ms};
 pub(in crate::http) fn router() -> Router<AppState> {
     Router::new()
         .route("/api/v1/jobs", get(list))
-        .route("/api/v1/jobs/{job_id}", get(show).delete(delete))
+        .route("/api/v1/jobs/{job_id}", get(show).patch(change).delete(delete))
         .route("/api/v1/jobs/{job_id}/cancel", post(cancel))
         .route("/api/v1/jobs/{job_id}/resume", post(resume))
 }
@@ -33,12 +35,20 @@ pub(in crate::http) fn upload_router() -> Router<AppState> {
 }
 
 /// A job as it is shown.
-pub(in crate::http) async fn view(state: &AppState, row: JobRow) -> Result<wire::Job, Problem> {
+async fn view(state: &AppState, row: JobRow) -> Result<wire::Job, Problem> {
+    let place = match state_of(&row) {
+        JobState::Queued => state.jobs.places(state.config.parallel_jobs).await?.remove(&row.id),
+        _ => None,
+    };
+    view_at(state, row, place).await
+}
+
+async fn view_at(state: &AppState, row: JobRow, place: Option<QueuePlace>) -> Result<wire::Job, Problem> {
     let reader = state.jobs.store.db.reader();
     let id: Uuid = row.id.parse().map_err(|error| Problem::internal(&error))?;
     let stages = job_stages::list(reader, id).await?;
     let images = job_images::counts(reader, id).await?;
-    Ok(wire::Job::new(row, &stages, images))
+    Ok(wire::Job::new(row, &stages, images, place))
 }
 
 async fn list(
@@ -56,15 +66,38 @@ async fn list(
     .await?;
     let more = cut(&mut rows, limit);
     let next_cursor = rows.last().filter(|_| more).map(|row| row.seq.to_string());
+    let mut places = match rows.iter().any(|row| state_of(row) == JobState::Queued) {
+        true => state.jobs.places(state.config.parallel_jobs).await?,
+        false => BTreeMap::new(),
+    };
     let mut shown = Vec::with_capacity(rows.len());
     for row in rows {
-        shown.push(view(&state, row).await?);
+        let place = places.remove(&row.id);
+        shown.push(view_at(&state, row, place).await?);
     }
     Ok(axum::Json(wire::JobPage { jobs: shown, next_cursor }).into_response())
 }
 
 async fn show(State(state): State<AppState>, JobId(id): JobId) -> Result<Response, Problem> {
     let row = state.jobs.find(id).await?;
+    Ok(axum::Json(view(&state, row).await?).into_response())
+}
+
+/// The JSON body of a change.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct JobChange {
+    priority: i64,
+}
+
+async fn change(
+    State(state): State<AppState>,
+    principal: Principal,
+    JobId(id): JobId,
+    Json(body): Json<JobChange>,
+) -> Result<Response, Problem> {
+    principal.check_priority(body.priority)?;
+    let row = state.jobs.set_priority(id, body.priority).await?;
     Ok(axum::Json(view(&state, row).await?).into_response())
 }
 
@@ -90,6 +123,8 @@ struct NewJobBody {
     dataset_id: Uuid,
     #[serde(default)]
     name: String,
+    #[serde(default)]
+    priority: i64,
     options: Option<serde_json::Map<String, serde_json::Value>>,
 }
 
@@ -102,12 +137,14 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
         "application/json" => {
             let Json(body): Json<NewJobBody> = Json::from_request(request, &state).await?;
             principal.check_sees(&state, Owned::Dataset(body.dataset_id)).await?;
+            principal.check_priority(body.priority)?;
             let new = NewJob {
                 id: Uuid::now_v7(),
                 name: body.name,
                 dataset: body.dataset_id,
                 options: serde_json::Value::Object(body.options.unwrap_or_default()),
                 ignored: None,
+                priority: body.priority,
                 owner_token: principal.owner(),
             };
             state.jobs.enqueue(new).await?
@@ -153,11 +190,19 @@ async fn create_with_upload(state: &AppState, principal: &Principal, parts: Part
     let mut own = OwnDataset { jobs: state.jobs.clone(), dataset, kept: false };
     let received = receive(state, parts, dataset, true).await?;
     let options = options_of(&received)?;
+    let priority = priority_of(&received)?;
+    principal.check_priority(priority)?;
     let name = received.name.unwrap_or_default();
     let (ignored, owner_token) = (Some(received.ignored), principal.owner());
-    let row = state.jobs.enqueue(NewJob { id, name, dataset, options, ignored, owner_token }).await?;
+    let row = state.jobs.enqueue(NewJob { id, name, dataset, options, ignored, priority, owner_token }).await?;
     own.kept = true;
     Ok(row)
+}
+
+fn priority_of(received: &Received) -> Result<i64, Problem> {
+    let text = received.priority.as_deref().map(str::trim).filter(|text| !text.is_empty()).unwrap_or("0");
+    text.parse()
+        .map_err(|_| Problem::new(Code::InvalidPriority).detail(format!("priority {text:?} is no whole number")))
 }
 
 fn options_of(received: &Received) -> Result<serde_json::Value, Problem> {

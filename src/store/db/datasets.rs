@@ -77,6 +77,16 @@ pub async fn list(
     .await
 }
 
+/// Notes that photographs were added.
+pub async fn touch(db: &mut SqliteConnection, id: Uuid, now_ms: i64) -> sqlx::Result<()> {
+    sqlx::query("UPDATE datasets SET changed_ms = ? WHERE id = ?")
+        .bind(now_ms)
+        .bind(id.to_string())
+        .execute(db)
+        .await?;
+    Ok(())
+}
+
 /// Removes a dataset with its image rows; whether it was there.
 pub async fn delete(db: &mut SqliteConnection, id: Uuid) -> sqlx::Result<bool> {
     let deleted = sqlx::query("DELETE FROM datasets WHERE id = ?").bind(id.to_string()).execute(db).await?;
@@ -99,6 +109,19 @@ pub async fn owned_only_by(db: &mut SqliteConnection, job: Uuid) -> sqlx::Result
 pub async fn release_owner(db: &mut SqliteConnection, job: Uuid) -> sqlx::Result<()> {
     sqlx::query("UPDATE datasets SET owner_job = NULL WHERE owner_job = ?").bind(job.to_string()).execute(db).await?;
     Ok(())
+}
+
+/// Datasets that no job refers to, no upload goes to, and to which nothing was added since a time. Those whose upload is still under
+/// way are left out.
+pub async fn unused_since(db: impl SqliteExecutor<'_>, before_ms: i64) -> sqlx::Result<Vec<String>> {
+    sqlx::query_scalar(
+        "SELECT id FROM datasets d WHERE owner_job IS NULL AND MAX(created_ms, COALESCE(changed_ms, 0)) < ?
+         AND NOT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id)
+         AND NOT EXISTS (SELECT 1 FROM uploads WHERE dataset_id = d.id AND stored = 0) ORDER BY seq",
+    )
+    .bind(before_ms)
+    .fetch_all(db)
+    .await
 }
 
 /// Datasets of uploads that were never acknowledged: made for a job that does not exist.

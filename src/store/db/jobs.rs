@@ -42,6 +42,10 @@ pub struct JobRow {
     pub error_code: Option<String>,
     /// Why it failed, for people.
     pub error_message: Option<String>,
+    /// Of two waiting jobs the one of higher priority starts first.
+    pub priority: i64,
+    /// The token it belongs to.
+    pub owner_token: Option<String>,
 }
 
 /// What a new job is made of.
@@ -59,15 +63,47 @@ pub struct NewJobRow {
     pub options: String,
     /// Files of its upload that were no photographs.
     pub ignored: Option<i64>,
+    /// Of two waiting jobs the one of higher priority starts first.
+    pub priority: i64,
     /// Whose it is.
     pub owner_token: Option<Uuid>,
+}
+
+/// A waiting or running job as far as the queue's order needs it.
+#[derive(Clone, Debug, FromRow)]
+pub struct QueuedRow {
+    /// Its id, a UUID in text.
+    pub id: String,
+    /// The token it belongs to.
+    pub owner_token: Option<String>,
+    /// Higher goes first.
+    pub priority: i64,
+    /// Place in the order of making.
+    pub seq: i64,
+    /// Photographs.
+    pub images: i64,
+    /// Their bytes.
+    pub size_bytes: i64,
+    /// When the latest attempt started.
+    pub started_ms: Option<i64>,
+    /// When it came to its end.
+    pub finished_ms: Option<i64>,
+}
+
+/// What the columns of a [`QueuedRow`] are.
+macro_rules! queued_columns {
+    () => {
+        "SELECT id, owner_token, priority, seq, started_ms, finished_ms,
+         (SELECT COUNT(*) FROM job_images WHERE job_id = jobs.id) AS images,
+         (SELECT COALESCE(SUM(size_bytes), 0) FROM job_images WHERE job_id = jobs.id) AS size_bytes FROM jobs "
+    };
 }
 
 /// Adds a queued job.
 pub async fn insert(db: &mut SqliteConnection, job: &NewJobRow) -> sqlx::Result<()> {
     sqlx::query(
-        "INSERT INTO jobs (id, seq, name, state, created_ms, dataset_id, options, ignored, owner_token)
-         VALUES (?, (SELECT COALESCE(MAX(seq), 0) + 1 FROM jobs), ?, 'queued', ?, ?, ?, ?, ?)",
+        "INSERT INTO jobs (id, seq, name, state, created_ms, dataset_id, options, ignored, priority, owner_token)
+         VALUES (?, (SELECT COALESCE(MAX(seq), 0) + 1 FROM jobs), ?, 'queued', ?, ?, ?, ?, ?, ?)",
     )
     .bind(job.id.to_string())
     .bind(&job.name)
@@ -75,6 +111,7 @@ pub async fn insert(db: &mut SqliteConnection, job: &NewJobRow) -> sqlx::Result<
     .bind(job.dataset.to_string())
     .bind(&job.options)
     .bind(job.ignored)
+    .bind(job.priority)
     .bind(job.owner_token.map(|token| token.to_string()))
     .execute(db)
     .await?;
@@ -102,9 +139,29 @@ pub async fn list(
         .await
 }
 
-/// The job that has waited longest.
-pub async fn next_queued(db: &mut SqliteConnection) -> sqlx::Result<Option<JobRow>> {
-    sqlx::query_as("SELECT * FROM jobs WHERE state = 'queued' ORDER BY seq LIMIT 1").fetch_optional(db).await
+/// The jobs that wait, or those that run.
+pub async fn queue(db: impl SqliteExecutor<'_>, state: &str) -> sqlx::Result<Vec<QueuedRow>> {
+    sqlx::query_as(concat!(queued_columns!(), "WHERE state = ? ORDER BY seq")).bind(state).fetch_all(db).await
+}
+
+/// The latest runs that came to a model without help of an earlier attempt.
+pub async fn latest_whole_runs(db: impl SqliteExecutor<'_>, limit: u32) -> sqlx::Result<Vec<QueuedRow>> {
+    sqlx::query_as(concat!(
+        queued_columns!(),
+        "WHERE state = 'succeeded'
+         AND NOT EXISTS (SELECT 1 FROM job_stages WHERE job_id = jobs.id AND job_stages.state = 'reused')
+         ORDER BY finished_ms DESC LIMIT ?"
+    ))
+    .bind(limit)
+    .fetch_all(db)
+    .await
+}
+
+/// Per token: its jobs that run, and when its latest started.
+pub async fn turns(db: impl SqliteExecutor<'_>) -> sqlx::Result<Vec<(Option<String>, i64, Option<i64>)>> {
+    sqlx::query_as("SELECT owner_token, SUM(state = 'running'), MAX(started_ms) FROM jobs GROUP BY owner_token")
+        .fetch_all(db)
+        .await
 }
 
 /// Every job in a state.
@@ -116,7 +173,7 @@ pub async fn in_state(db: &mut SqliteConnection, state: &str) -> sqlx::Result<Ve
 pub async fn update_state(db: &mut SqliteConnection, job: &JobRow) -> sqlx::Result<()> {
     sqlx::query(
         "UPDATE jobs SET state = ?, cancel_requested = ?, started_ms = ?, finished_ms = ?, interruptions = ?, stages_finished = ?,
-         models = ?, error_stage = ?, error_code = ?, error_message = ? WHERE id = ?",
+         priority = ?, models = ?, error_stage = ?, error_code = ?, error_message = ? WHERE id = ?",
     )
     .bind(&job.state)
     .bind(job.cancel_requested)
@@ -124,6 +181,7 @@ pub async fn update_state(db: &mut SqliteConnection, job: &JobRow) -> sqlx::Resu
     .bind(job.finished_ms)
     .bind(job.interruptions)
     .bind(job.stages_finished)
+    .bind(job.priority)
     .bind(&job.models)
     .bind(&job.error_stage)
     .bind(&job.error_code)
@@ -138,6 +196,16 @@ pub async fn update_state(db: &mut SqliteConnection, job: &JobRow) -> sqlx::Resu
 pub async fn delete(db: &mut SqliteConnection, id: Uuid) -> sqlx::Result<()> {
     sqlx::query("DELETE FROM jobs WHERE id = ?").bind(id.to_string()).execute(db).await?;
     Ok(())
+}
+
+/// Jobs that came to their end before a time.
+pub async fn ended_before(db: impl SqliteExecutor<'_>, before_ms: i64) -> sqlx::Result<Vec<String>> {
+    sqlx::query_scalar(
+        "SELECT id FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') AND finished_ms < ? ORDER BY seq",
+    )
+    .bind(before_ms)
+    .fetch_all(db)
+    .await
 }
 
 /// Whether any job refers to a dataset, and whether one of them is queued or running.
