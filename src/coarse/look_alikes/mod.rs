@@ -80,15 +80,15 @@ pub fn reconstruct(
     keep_going: &(dyn Fn() -> bool + Sync),
     progress: &(dyn Fn(usize) + Sync),
 ) -> (CoarseModels, LookAlikeAccount) {
-    let build = |left_out: &BTreeSet<(ImageId, ImageId)>, apart: ApartImages| {
+    let without = |left_out: &BTreeSet<(ImageId, ImageId)>, apart: ApartImages| {
         let kept = input.graph.pairs.iter().filter(|(pair, _)| !left_out.contains(pair));
         let graph = MatchGraph { pairs: kept.map(|(&pair, geometry)| (pair, geometry.clone())).collect() };
-        let input = MapperInput { images: input.images.clone(), cameras: input.cameras.clone(), graph, apart };
-        mapper::reconstruct(&input, mapper_options, seed, keep_going, progress)
+        MapperInput { images: input.images.clone(), cameras: input.cameras.clone(), graph, apart }
     };
     let suspects = if options.enabled { skeleton::suspects(input, options) } else { Vec::new() };
     let put_off: BTreeSet<_> = suspects.iter().map(|suspect| suspect.images).collect();
-    let models = build(&put_off, ApartImages::default());
+    let confident = without(&put_off, ApartImages::default());
+    let models = mapper::reconstruct(&confident, mapper_options, seed, keep_going, progress);
     if suspects.is_empty() {
         return (models, LookAlikeAccount::default());
     }
@@ -98,7 +98,8 @@ pub fn reconstruct(
     if account.cut.len() == suspects.len() && apart.is_empty() {
         return (models, account);
     }
-    (build(&account.cut.iter().map(|cut| cut.images).collect(), apart), account)
+    let judged = without(&account.cut.iter().map(|cut| cut.images).collect(), apart);
+    (mapper::extend(&judged, &models, mapper_options, seed, keep_going, progress), account)
 }
 
 /// The suspects that are cut: those whose matches join two places, and, once there is such a pair and the set is so known to

@@ -6,7 +6,7 @@ use super::Mapper;
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
 use crate::coarse::filter::filter;
 use crate::coarse::intrinsics::{enrich_cameras, free_intrinsics, merge_agreeing_cameras};
-use crate::scene::{ImageId, Point3dId};
+use crate::scene::{CameraId, ImageId, Point3dId};
 
 impl Mapper<'_> {
     /// Adjusts the initial pair, intrinsics fixed, and filters.
@@ -34,7 +34,7 @@ impl Mapper<'_> {
             let before = self.model.num_observations();
             let split = self.split_cameras();
             let mut config = BundleConfig::global(&self.model, FreeIntrinsics::default());
-            config.intrinsics = free_intrinsics(&self.model, &self.options.intrinsics);
+            config.intrinsics = self.free_intrinsics();
             bundle::adjust(&mut self.model, &config, &self.options.global_bundle);
             let merged = merge_agreeing_cameras(&mut self.model, &self.options.intrinsics);
             let removed = self.filter(None);
@@ -48,9 +48,18 @@ impl Mapper<'_> {
         self.drop_unsupported();
     }
 
+    /// What is freed of every camera: principal points only at the end, when images that do not share a camera have been told
+    /// apart. Before, a principal point may take up what is the difference of two zooms, and then it can't be told any more.
+    fn free_intrinsics(&self) -> BTreeMap<CameraId, FreeIntrinsics> {
+        let free = free_intrinsics(&self.model, &self.options.intrinsics).into_iter();
+        free.map(|(id, free)| (id, FreeIntrinsics { principal_point: free.principal_point && self.is_whole, ..free }))
+            .collect()
+    }
+
     /// Gives every camera the model its images determine and adjusts a last time.
     pub(super) fn finish(&mut self) {
         self.split_cameras_by_adjustment();
+        self.is_whole = true;
         enrich_cameras(&mut self.model, &self.options.intrinsics);
         self.adjust_globally();
     }

@@ -6,6 +6,7 @@
 
 mod adjust;
 mod cameras;
+mod extend;
 mod initial;
 mod options;
 mod register;
@@ -13,6 +14,7 @@ mod register;
 mod tests;
 mod triangulate;
 
+pub use extend::extend;
 pub use options::MapperOptions;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -173,6 +175,8 @@ pub(super) struct Mapper<'a> {
     point_of_track: Vec<Option<Point3dId>>,
     trials: BTreeMap<ImageId, u32>,
     failures: BTreeMap<ImageId, Unregistered>,
+    /// Whether no more images will be registered.
+    is_whole: bool,
 }
 
 impl<'a> Mapper<'a> {
@@ -195,6 +199,7 @@ impl<'a> Mapper<'a> {
             point_of_track: vec![None; tracks.tracks.len()],
             trials: BTreeMap::new(),
             failures: BTreeMap::new(),
+            is_whole: false,
         }
     }
 
