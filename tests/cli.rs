@@ -4,6 +4,8 @@
 
 #[path = "cli/bad_pictures.rs"]
 mod bad_pictures;
+#[path = "cli/degenerate.rs"]
+mod degenerate;
 #[path = "cli/determinism.rs"]
 mod determinism;
 #[path = "cli/evaluate.rs"]

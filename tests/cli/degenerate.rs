@@ -1,0 +1,131 @@
+//! Sets that leave a two-view geometry undetermined: views turned on the spot, and a flat scene.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use image::{Rgb, RgbImage};
+use multistage::formats::colmap::{ColmapModel, read_cameras_bin, read_images_bin, read_points3d_bin};
+use multistage::math::Rng;
+use multistage::scene::Reconstruction;
+use nalgebra::{Matrix3, Rotation3, Vector3};
+
+use super::multistage;
+use super::rendered::photographs;
+
+const SIZE_PX: [u32; 2] = [640, 480];
+const NUM_PHOTOGRAPHS: usize = 9;
+/// The rendered photographs' focal length.
+const FOCAL_PX: f64 = 0.86 * 640.0;
+
+fn calibration(focal_px: f64) -> Matrix3<f64> {
+    let [width, height] = SIZE_PX.map(f64::from);
+    Matrix3::new(focal_px, 0.0, width / 2.0, 0.0, focal_px, height / 2.0, 0.0, 0.0, 1.0)
+}
+
+/// The picture that shows `source` through a homography from its pixels to the source's, with a little noise; black beyond.
+fn warped(source: &RgbImage, to_source: &Matrix3<f64>, rng: &mut Rng) -> RgbImage {
+    RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], |x, y| {
+        let at = to_source * Vector3::new(f64::from(x) + 0.5, f64::from(y) + 0.5, 1.0);
+        let (x, y) = (at.x / at.z - 0.5, at.y / at.z - 0.5);
+        let inside = x >= 0.0 && y >= 0.0 && x < f64::from(source.width() - 1) && y < f64::from(source.height() - 1);
+        if !inside {
+            return Rgb([0; 3]);
+        }
+        let (part_x, part_y) = (x.fract(), y.fract());
+        let pixel = |dx: u32, dy: u32| source.get_pixel(x as u32 + dx, y as u32 + dy).0.map(f64::from);
+        let (a, b, c, d) = (pixel(0, 0), pixel(1, 0), pixel(0, 1), pixel(1, 1));
+        let noise = rng.range(-2.0, 2.0);
+        Rgb(std::array::from_fn(|k| {
+            let upper = a[k] * (1.0 - part_x) + b[k] * part_x;
+            let lower = c[k] * (1.0 - part_x) + d[k] * part_x;
+            (upper * (1.0 - part_y) + lower * part_y + noise).clamp(0.0, 255.0) as u8
+        }))
+    })
+}
+
+/// The centres of the largest model's cameras by the names of their pictures.
+fn centers(images: &Path, out: &Path) -> BTreeMap<String, Vector3<f64>> {
+    let run = multistage(&["reconstruct", images.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    let open = |name: &str| BufReader::new(File::open(out.join("sparse/0").join(name)).unwrap());
+    let model = ColmapModel {
+        cameras: read_cameras_bin(&mut open("cameras.bin")).unwrap(),
+        images: read_images_bin(&mut open("images.bin")).unwrap(),
+        points: read_points3d_bin(&mut open("points3D.bin")).unwrap(),
+    };
+    let (model, names): (Reconstruction, _) = model.into_reconstruction().unwrap();
+    model.images().iter().map(|(id, image)| (names[id].clone(), image.center_in_world())).collect()
+}
+
+fn extent(centers: impl Iterator<Item = Vector3<f64>> + Clone) -> f64 {
+    let low = centers.clone().fold(Vector3::repeat(f64::INFINITY), |low, at| low.inf(&at));
+    let high = centers.fold(Vector3::repeat(f64::NEG_INFINITY), |high, at| high.sup(&at));
+    (high - low).norm()
+}
+
+#[test]
+fn views_turned_on_the_spot_find_the_same_spot() {
+    let folder = tempfile::tempdir().unwrap();
+    let (spec, images) = (folder.path().join("spec.json"), folder.path().join("images"));
+    // A lens without distortion, so that a turn is a homography.
+    let options = serde_json::json!({
+        "scene": "temple", "num_images": NUM_PHOTOGRAPHS, "arc_deg": 100, "width": SIZE_PX[0], "height": SIZE_PX[1], "k1": 0,
+    });
+    std::fs::write(&spec, options.to_string()).unwrap();
+    let rendered = multistage(&["synthesize", spec.to_str().unwrap(), "--out", folder.path().to_str().unwrap()]);
+    assert!(rendered.status.success(), "{}", String::from_utf8_lossy(&rendered.stderr));
+    let source = image::open(images.join("temple_004.jpg")).unwrap().to_rgb8();
+    let (k, mut rng) = (calibration(FOCAL_PX), Rng::from_parts(&[1]));
+    for (at, [pitch, yaw, roll]) in [[0.0, 0.12, 0.0], [0.03, -0.12, 0.0], [-0.05, 0.08, 0.15]].into_iter().enumerate()
+    {
+        let turn = Rotation3::from_euler_angles(pitch, yaw, roll);
+        let to_source = k * turn.matrix() * k.try_inverse().unwrap();
+        warped(&source, &to_source, &mut rng).save(images.join(format!("turned_{at}.png"))).unwrap();
+    }
+    let found = centers(&images, &folder.path().join("out"));
+    assert_eq!(found.len(), NUM_PHOTOGRAPHS + 3, "{:?}", found.keys());
+    let size = extent(found.values().copied());
+    for (name, center) in found.iter().filter(|(name, _)| name.starts_with("turned")) {
+        let distance = (center - found["temple_004.jpg"]).norm() / size;
+        assert!(distance < 0.01, "{name} is {distance} of the set's extent off");
+    }
+}
+
+/// A picture hung on a wall and photographed from an arc, by pictures without EXIF.
+#[test]
+fn a_flat_scene_is_reconstructed() {
+    let folder = tempfile::tempdir().unwrap();
+    let images = folder.path().join("images");
+    std::fs::create_dir(&images).unwrap();
+    let painting = image::open(photographs().join("temple_006.jpg")).unwrap().to_rgb8();
+    let (width, height) = (f64::from(painting.width()), f64::from(painting.height()));
+    // The painting is 2 wide, about the origin, in the plane z = 0; cameras look at its middle from in front (z < 0).
+    let to_pixel = Matrix3::new(width / 2.0, 0.0, width / 2.0, 0.0, width / 2.0, height / 2.0, 0.0, 0.0, 1.0);
+    let (k, mut rng) = (calibration(700.0), Rng::from_parts(&[2]));
+    let mut truth = BTreeMap::new();
+    for at in 0..9 {
+        let angle = -0.7 + 1.4 * f64::from(at) / 8.0;
+        let center = Vector3::new(2.2 * angle.sin(), 0.35 * (1.7 * f64::from(at)).sin(), -2.2 * angle.cos());
+        let z = -center.normalize();
+        let x = Vector3::y().cross(&z).normalize();
+        let rotation = Matrix3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]);
+        let translation = -rotation * center;
+        let to_view = k * Matrix3::from_columns(&[rotation.column(0).into(), rotation.column(1).into(), translation]);
+        let name = format!("wall_{at}.png");
+        warped(&painting, &(to_pixel * to_view.try_inverse().unwrap()), &mut rng).save(images.join(&name)).unwrap();
+        truth.insert(name, center);
+    }
+    let found = centers(&images, &folder.path().join("out"));
+    assert_eq!(found.len(), truth.len());
+    // Distances between cameras, up to one scale, do not ask for an alignment.
+    let distances = |of: &BTreeMap<String, Vector3<f64>>| -> Vec<f64> {
+        let all: Vec<Vector3<f64>> = of.values().copied().collect();
+        all.iter().enumerate().flat_map(|(k, a)| all[..k].iter().map(move |b| (a - b).norm())).collect()
+    };
+    let (found, truth) = (distances(&found), distances(&truth));
+    let scale = truth.iter().sum::<f64>() / found.iter().sum::<f64>();
+    let worst = found.iter().zip(&truth).map(|(a, b)| (scale * a - b).abs()).fold(0.0, f64::max);
+    assert!(worst < 0.03, "a distance of cameras 2.2 from the wall is {worst} off");
+}
