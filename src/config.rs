@@ -85,6 +85,8 @@ pub struct ServerConfig {
     pub data_dir: PathBuf,
     /// Worker threads of a job.
     pub threads: usize,
+    /// Memory that all jobs together may take; none for what the system or the control group allows.
+    pub memory_bytes: Option<u64>,
     /// Jobs that run at once.
     pub parallel_jobs: usize,
     /// Jobs that ended, and datasets that nothing used, are removed after so long; none for never.
@@ -118,6 +120,7 @@ impl ServerConfig {
             bind: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080),
             data_dir: data_dir.to_path_buf(),
             threads: std::thread::available_parallelism().map_or(1, usize::from),
+            memory_bytes: None,
             parallel_jobs: 1,
             keep: None,
             seed: 0,

@@ -41,6 +41,9 @@ pub(super) struct Args {
     /// Worker threads of a job [default: all of the machine's].
     #[arg(long, env = "MULTISTAGE_THREADS")]
     threads: Option<NonZeroUsize>,
+    /// Memory that all jobs together may take, in bytes [default: 85 % of what the system or the control group allows].
+    #[arg(long, env = "MULTISTAGE_MAX_MEMORY_BYTES")]
+    max_memory_bytes: Option<NonZeroU64>,
     /// Jobs that run at once; each has its own threads and memory.
     #[arg(long, env = "MULTISTAGE_MAX_PARALLEL_JOBS", default_value = "1")]
     max_parallel_jobs: NonZeroUsize,
@@ -78,6 +81,7 @@ impl Args {
         config.bind = self.bind;
         config.threads = self.threads.map_or(config.threads, NonZeroUsize::get);
         config.parallel_jobs = self.max_parallel_jobs.get();
+        config.memory_bytes = self.max_memory_bytes.map(NonZeroU64::get);
         config.keep = self.keep_days.map(|days| Duration::from_secs(24 * 3600 * u64::from(days)));
         config.seed = self.seed;
         let connections = &mut config.connections;

@@ -85,6 +85,7 @@ codes! {
     InternalError "internal_error" 500,
     NotReady "not_ready" 503,
     DiskFull "disk_full" 507,
+    DiskError "disk_error" 507,
 }
 
 /// What went wrong.
@@ -197,6 +198,10 @@ impl From<StoreError> for Problem {
     fn from(error: StoreError) -> Self {
         if error.is_disk_full() {
             return Self::new(Code::DiskFull).detail("the disk is full");
+        }
+        if error.is_disk_error() {
+            tracing::error!(%error, "the disk fails");
+            return Self::new(Code::DiskError).detail("the disk can't be read or written");
         }
         match error {
             StoreError::FileConflict(path) => {

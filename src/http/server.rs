@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{AppState, connection, router};
 use crate::config::ServerConfig;
-use crate::jobs::{Engine, Executor, Hub, Jobs, recover, remove_stale};
+use crate::jobs::{Engine, Executor, Hub, Jobs, Machine, recover, remove_stale};
 use crate::store::{Store, StoreError};
 
 /// Between two looks for uploads whose time is over.
@@ -64,7 +64,9 @@ impl Server {
         let address = listener.local_addr().map_err(bind_failed)?;
         let jobs = Jobs { store: Arc::clone(&store), hub: Arc::new(Hub::default()), engine };
         let shutdown = CancellationToken::new();
-        let executor = Executor { jobs: jobs.clone(), threads: config.threads, seed: config.seed };
+        let machine = Machine::detect(config.threads, config.memory_bytes);
+        tracing::info!(?machine, "jobs may take this much");
+        let executor = Executor::new(jobs.clone(), machine, config.seed);
         let executor = tokio::spawn(executor.run(config.parallel_jobs, shutdown.clone()));
         tokio::spawn(sweep(Arc::clone(&store), config.keep, shutdown.clone()));
         let grace = config.shutdown_grace;
@@ -105,6 +107,9 @@ async fn sweep(store: Arc<Store>, keep: Option<Duration>, shutdown: Cancellation
                 Ok(stale) => tracing::info!(?stale, "jobs and datasets were kept long enough and are removed"),
                 Err(error) => tracing::warn!(%error, "what was kept long enough could not be removed"),
             }
+        }
+        if let Err(error) = store.keep_ballast() {
+            tracing::warn!(%error, "the ballast could not be made");
         }
         // What `multistage cleanup` noted goes, too.
         if let Err(error) = store.discard_deleted().await {

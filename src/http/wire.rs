@@ -39,6 +39,7 @@ pub(super) struct Job {
     options: serde_json::Value,
     priority: i64,
     queue: Option<QueuePlace>,
+    resources: Option<Resources>,
     images: ImageCounts,
     stage: Option<CurrentStage>,
     stages: Vec<StageView>,
@@ -46,6 +47,15 @@ pub(super) struct Job {
     models: Vec<Model>,
     error: Option<ErrorView>,
     links: JobLinks,
+}
+
+/// What a job was given.
+#[derive(Serialize)]
+struct Resources {
+    threads: i64,
+    memory_bytes: Option<i64>,
+    disk_bytes: Option<i64>,
+    note: Option<String>,
 }
 
 #[derive(Serialize)]
@@ -110,6 +120,12 @@ impl Job {
             stages: stages.iter().map(StageView::of).collect(),
             priority: row.priority,
             queue: place,
+            resources: row.threads.filter(|threads| *threads > 0).map(|threads| Resources {
+                threads,
+                memory_bytes: row.memory_bytes,
+                disk_bytes: row.needed_bytes,
+                note: row.resource_note.clone(),
+            }),
             eta_s: if running { estimate(stages, now_ms()) } else { place.and_then(|place| place.done_in_s) },
             error: ErrorView::of(&row),
             models: models

@@ -1,7 +1,9 @@
 //! What the executor runs: the pipeline in the service, something quick in tests.
 
+use std::path::PathBuf;
+
 use crate::formats::report::Report;
-use crate::pipeline::{Context, PipelineError, ReconstructionOptions, RunPaths, reconstruct};
+use crate::pipeline::{Context, Needs, PipelineError, ReconstructionOptions, RunPaths, Stage, estimate, reconstruct};
 
 /// Makes models out of photographs. Called from a thread of the job's own; may take hours and may panic.
 pub trait Engine: Send + Sync + 'static {
@@ -10,6 +12,12 @@ pub trait Engine: Send + Sync + 'static {
     /// # Errors
     /// Every violation, as sentences.
     fn validate(&self, options: &serde_json::Value) -> Result<(), Vec<String>>;
+
+    /// What a run on these photographs will take.
+    ///
+    /// # Errors
+    /// Why that can't be said.
+    fn needs(&self, images: &[PathBuf], options: &serde_json::Value) -> Result<Needs, PipelineError>;
 
     /// Runs to the end. That no model could be made is no error: the report then lists none.
     ///
@@ -37,6 +45,11 @@ impl Engine for PipelineEngine {
             Err(PipelineError::InvalidOptions(errors)) => Err(errors),
             Err(error) => Err(vec![error.to_string()]),
         }
+    }
+
+    fn needs(&self, images: &[PathBuf], options: &serde_json::Value) -> Result<Needs, PipelineError> {
+        let needs = estimate(images, &parse(options)?);
+        needs.map_err(|source| PipelineError::Io { stage: Stage::Intake, path: PathBuf::new(), source })
     }
 
     fn run(&self, paths: &RunPaths, options: &serde_json::Value, context: &Context) -> Result<Report, PipelineError> {

@@ -1,7 +1,7 @@
 //! The executor: takes jobs out of the queue and runs each to its end on a thread of its own.
 //!
 //! One [`tick`](Executor::tick):
-//! 1. claim the job that has waited longest; none: [`Tick::Idle`];
+//! 1. claim the first waiting job that fits into memory and disk; none: [`Tick::Idle`];
 //! 2. check that its photographs are the ones it was queued with;
 //! 3. run the engine on a fresh thread, a panic caught, while progress goes into the database;
 //! 4. publish the outputs, then commit verdicts, models and the final state in one transaction.
@@ -9,30 +9,36 @@
 //! A crash at any moment leaves the job `running`; the next start queues it again, and the engine goes on from its artifacts.
 
 use std::any::Any;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
+use std::io;
 use std::panic::AssertUnwindSafe;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::{oneshot, watch};
+use sqlx::SqliteConnection;
+use tokio::sync::{Mutex, oneshot, watch};
+use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::progress::{Progress, Recorder, WRITE_INTERVAL, WatchSink};
-use super::queue::{job_id, transition};
+use super::queue::{Given, job_id, transition};
 use super::view::ErrorView;
-use super::{JobState, Jobs, publish};
+use super::{Fit, Hold, JobState, Jobs, Machine, fit, publish};
 use crate::formats::report::Report;
-use crate::pipeline::{Context, PipelineError, RunPaths};
+use crate::pipeline::{Context, Needs, PipelineError, RunPaths};
 use crate::store::db::job_outputs::JobOutputRow;
 use crate::store::db::jobs::JobRow;
-use crate::store::db::{job_images, job_outputs, jobs};
-use crate::store::{StoreError, atomic};
+use crate::store::db::{job_images, job_outputs, job_stages, jobs};
+use crate::store::{DataDir, StoreError, atomic};
 
 /// The idle executor looks into the queue so often even if nobody wakes it.
 const IDLE_POLL: Duration = Duration::from_secs(5);
 /// Between attempts to store a job's end while the database refuses, for instance because the disk is full.
 const STORE_RETRY: Duration = Duration::from_secs(2);
+/// A job may fill the disk so often in a row without a further stage coming to its end.
+const MAX_DISK_FULL: i64 = 3;
 /// Stack of a job's thread; the engine's recursion is shallow, but matrices on the stack are not.
 const STACK_BYTES: usize = 16 << 20;
 
@@ -50,10 +56,30 @@ pub enum Tick {
 pub struct Executor {
     /// Which.
     pub jobs: Jobs,
-    /// Worker threads of a job.
-    pub threads: usize,
+    /// What there is for them.
+    pub machine: Machine,
     /// Seed of every run.
     pub seed: u64,
+    /// Held while a job is chosen, so that no two take the same room.
+    desk: Arc<Mutex<Desk>>,
+}
+
+/// What choosing needs to know.
+#[derive(Default)]
+struct Desk {
+    /// Memory of the running jobs.
+    running: HashMap<Uuid, u64>,
+    /// Estimates of the waiting ones.
+    needs: HashMap<Uuid, Needs>,
+}
+
+/// What becomes of a job that was claimed.
+#[derive(Debug)]
+enum Choice {
+    /// It runs.
+    Run { threads: usize },
+    /// It never fits; why.
+    Refuse(String),
 }
 
 /// How a run ended.
@@ -64,6 +90,11 @@ enum Outcome {
 }
 
 impl Executor {
+    /// An executor of these jobs on this machine.
+    pub fn new(jobs: Jobs, machine: Machine, seed: u64) -> Self {
+        Self { jobs, machine, seed, desk: Arc::default() }
+    }
+
     /// Runs jobs, `parallel` at once, until `shutdown`; returns once the running ones stopped.
     pub async fn run(self, parallel: usize, shutdown: CancellationToken) {
         let lanes: Vec<_> = (0..parallel.max(1))
@@ -84,6 +115,8 @@ impl Executor {
     async fn lane(&self, shutdown: &CancellationToken) {
         while !shutdown.is_cancelled() {
             let pause = match self.tick().await {
+                // It goes on once there is room; not at once.
+                Ok(Tick::Ran(_, JobState::Queued)) => STORE_RETRY,
                 Ok(Tick::Ran(..)) => continue,
                 Ok(Tick::Idle) => IDLE_POLL,
                 Err(error) => {
@@ -104,17 +137,82 @@ impl Executor {
     /// # Errors
     /// When the queue can't be read.
     pub async fn tick(&self) -> Result<Tick, StoreError> {
-        let Some(row) = self.jobs.claim().await? else { return Ok(Tick::Idle) };
+        let Some((row, choice)) = self.next().await? else { return Ok(Tick::Idle) };
         let id = job_id(&row)?;
-        tracing::info!(job = %id, "job started");
-        let outcome = match self.check_input(&row).await {
-            Ok(()) => self.run_engine(id, &row).await,
-            Err(error) => Outcome::Failed(error),
+        tracing::info!(job = %id, ?choice, "job started");
+        let outcome = match choice {
+            Choice::Refuse(message) => {
+                Outcome::Failed(ErrorView { stage: None, code: "not_enough_memory".to_owned(), message })
+            }
+            Choice::Run { threads } => match self.check_input(&row).await {
+                Ok(()) => self.run_engine(id, &row, threads).await,
+                Err(error) => Outcome::Failed(error),
+            },
         };
         self.jobs.hub.ended(id);
         let state = self.finish(id, outcome).await;
+        self.desk.lock().await.running.remove(&id);
+        self.jobs.store.release_space(id);
+        if state != JobState::Queued {
+            // Another may have waited for what it had.
+            self.jobs.hub.wake_executor();
+        }
         tracing::info!(job = %id, %state, "job ended");
         Ok(Tick::Ran(id, state))
+    }
+
+    /// Claims the first waiting job that fits.
+    async fn next(&self) -> Result<Option<(JobRow, Choice)>, StoreError> {
+        let store = &self.jobs.store;
+        let mut desk = self.desk.lock().await;
+        let waiting = self.jobs.waiting().await?;
+        desk.needs.retain(|job, _| waiting.contains(job));
+        for id in waiting {
+            let Some(row) = jobs::find(store.db.reader(), id).await? else { continue };
+            let mut needs = match desk.needs.get(&id) {
+                Some(needs) => *needs,
+                None => self.estimate(id, &row).await?,
+            };
+            desk.needs.insert(id, needs);
+            // A run that filled the disk needs more than was thought.
+            needs.disk_bytes = needs.disk_bytes.max(row.needed_bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0));
+            let (data, taken) = (store.data.clone(), desk.running.values().sum());
+            let written =
+                spawn_blocking(move || DataDir::folder_bytes(&data.job(id))).await.map_err(io::Error::other)??;
+            let free = store.free_bytes().await?;
+            let (choice, given) = match fit(&needs, &self.machine, taken, free, written) {
+                Fit::Wait(hold) => {
+                    self.jobs.hold(id, hold).await?;
+                    continue;
+                }
+                Fit::Never(why) => (Choice::Refuse(why), Given::default()),
+                Fit::Start { threads, note } => {
+                    let memory_bytes = needs.memory_bytes(threads);
+                    let given = Given { threads, note, memory_bytes, disk_bytes: needs.disk_bytes };
+                    (Choice::Run { threads }, given)
+                }
+            };
+            let Some(row) = self.jobs.claim(id, &given).await? else { continue };
+            desk.running.insert(id, given.memory_bytes);
+            store.reserve_space(id, given.disk_bytes);
+            return Ok(Some((row, choice)));
+        }
+        Ok(None)
+    }
+
+    /// What a job will take. Nothing where that can't be said: the run then tells what is wrong.
+    async fn estimate(&self, id: Uuid, row: &JobRow) -> Result<Needs, StoreError> {
+        let store = &self.jobs.store;
+        let folder = store.data.images(row.dataset_id.parse().map_err(|_| StoreError::NotFound)?);
+        let images = job_images::list(store.db.reader(), id, None, -1, u32::MAX).await?;
+        let images: Vec<PathBuf> = images.into_iter().map(|image| folder.join(image.path)).collect();
+        let options = serde_json::from_str(&row.options).unwrap_or_default();
+        let engine = Arc::clone(&self.jobs.engine);
+        let needs = spawn_blocking(move || engine.needs(&images, &options)).await.map_err(io::Error::other)?;
+        Ok(needs.unwrap_or_else(|error| {
+            tracing::warn!(job = %id, %error, "what a job needs can't be estimated");
+            Needs::default()
+        }))
     }
 
     /// Compares the dataset's folder with the job's list: a file without a row was never acknowledged and goes; a row without its
@@ -147,7 +245,7 @@ impl Executor {
         }
     }
 
-    async fn run_engine(&self, id: Uuid, row: &JobRow) -> Outcome {
+    async fn run_engine(&self, id: Uuid, row: &JobRow, threads: usize) -> Outcome {
         let hub = &self.jobs.hub;
         let cancel = hub.started(id);
         // Somebody may have asked between the claim and the flag's birth.
@@ -157,8 +255,7 @@ impl Executor {
             cancel.cancel();
         }
         let (progress_in, mut progress) = watch::channel(Progress::default());
-        let context =
-            Context { seed: self.seed, threads: self.threads, cancel, progress: Arc::new(WatchSink(progress_in)) };
+        let context = Context { seed: self.seed, threads, cancel, progress: Arc::new(WatchSink(progress_in)) };
         let mut finished = match self.spawn(id, row, context) {
             Ok(finished) => finished,
             Err(error) => {
@@ -233,7 +330,12 @@ impl Executor {
                     self.forget_work(id, state).await;
                     return state;
                 }
-                Err(error) => tracing::error!(job = %id, %error, "the end of a job could not be stored"),
+                Err(error) => {
+                    tracing::error!(job = %id, %error, "the end of a job could not be stored");
+                    if error.is_disk_full() {
+                        self.jobs.store.drop_ballast();
+                    }
+                }
             }
             if self.jobs.hub.is_stopping() {
                 return JobState::Running;
@@ -273,8 +375,12 @@ impl Executor {
             // The process ends: the job goes on after the next start.
             Outcome::Cancelled if self.jobs.hub.is_stopping() && !row.cancel_requested => (JobState::Queued, None),
             Outcome::Cancelled => (JobState::Cancelled, None),
+            Outcome::Failed(error) if error.code == "disk_full" && !row.cancel_requested => {
+                (wait_for_space(&mut row, id, &mut tx).await?, Some(error.clone()))
+            }
             Outcome::Failed(error) => (JobState::Failed, Some(error.clone())),
         };
+        let error = error.filter(|_| state == JobState::Failed);
         transition(&mut tx, &mut row, state, error).await?;
         tx.commit().await?;
         Ok(state)
@@ -292,6 +398,22 @@ impl Executor {
             Err(error) => tracing::error!(job = %id, %error, "removing the work folder panicked"),
         }
     }
+}
+
+/// Sends a job that filled the disk back to wait for more room than was thought, unless it keeps filling it without getting
+/// anywhere.
+async fn wait_for_space(row: &mut JobRow, id: Uuid, tx: &mut SqliteConnection) -> Result<JobState, StoreError> {
+    let stages = job_stages::list(&mut *tx, id).await?;
+    let finished = stages.iter().filter(|stage| stage.state == "done" || stage.state == "reused").count();
+    let finished = i64::try_from(finished).unwrap_or(i64::MAX);
+    row.interruptions = if finished > row.stages_finished { 1 } else { row.interruptions + 1 };
+    row.stages_finished = row.stages_finished.max(finished);
+    if row.interruptions > MAX_DISK_FULL {
+        return Ok(JobState::Failed);
+    }
+    row.held = Some(Hold::DiskFull.as_str().to_owned());
+    row.needed_bytes = row.needed_bytes.map(|bytes| bytes.saturating_add(bytes / 2));
+    Ok(JobState::Queued)
 }
 
 type EngineResult = Result<Result<Report, PipelineError>, Box<dyn Any + Send>>;

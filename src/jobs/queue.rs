@@ -10,7 +10,7 @@ use uuid::Uuid;
 use super::eta::{Eta, estimate};
 use super::schedule::{self, QueuePlace, Rates, Size, Turns, Waiting};
 use super::view::{ErrorView, StateEvent, time_text};
-use super::{Engine, Hub, JobState};
+use super::{Engine, Hold, Hub, JobState};
 use crate::store::db::jobs::{JobRow, NewJobRow, QueuedRow};
 use crate::store::db::{dataset_images, datasets, job_events, job_images, job_outputs, job_stages, jobs, now_ms};
 use crate::store::{Quantity, Store, StoreError, check_quota};
@@ -50,6 +50,19 @@ pub struct NewJob {
     pub priority: i64,
     /// The token it belongs to.
     pub owner_token: Option<Uuid>,
+}
+
+/// What a job is given when it starts.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Given {
+    /// Worker threads.
+    pub(super) threads: usize,
+    /// Why not all.
+    pub(super) note: Option<String>,
+    /// Memory it may need.
+    pub(super) memory_bytes: u64,
+    /// Room on the disk it may need.
+    pub(super) disk_bytes: u64,
 }
 
 /// Why a move was refused.
@@ -146,6 +159,7 @@ fn size(row: &QueuedRow) -> Size {
 async fn ordered_queue(db: &mut SqliteConnection) -> Result<Vec<Waiting>, StoreError> {
     let waiting = jobs::queue(&mut *db, "queued").await?.into_iter().map(|row| Waiting {
         size: size(&row),
+        held: Hold::ALL.into_iter().find(|hold| row.held.as_deref() == Some(hold.as_str())),
         id: row.id,
         owner: row.owner_token,
         priority: row.priority,
@@ -235,17 +249,50 @@ impl Jobs {
         Ok(row)
     }
 
-    /// Takes the job whose turn it is out of the queue and marks it running.
-    pub(super) async fn claim(&self) -> Result<Option<JobRow>, StoreError> {
+    /// The waiting jobs, the next one first.
+    pub(super) async fn waiting(&self) -> Result<Vec<Uuid>, StoreError> {
+        let mut snapshot = self.store.db.reader().begin().await?;
+        let ordered = ordered_queue(&mut snapshot).await?;
+        Ok(ordered.iter().filter_map(|job| job.id.parse().ok()).collect())
+    }
+
+    /// Takes a job out of the queue and marks it running with what it was given; none when it does not wait any more.
+    pub(super) async fn claim(&self, id: Uuid, given: &Given) -> Result<Option<JobRow>, StoreError> {
         let mut tx = self.store.db.write().await?;
-        let ordered = ordered_queue(&mut tx).await?;
-        let Some(next) = ordered.first().and_then(|job| job.id.parse().ok()) else { return Ok(None) };
-        let Some(mut row) = jobs::find(&mut *tx, next).await? else { return Ok(None) };
+        let Some(mut row) = jobs::find(&mut *tx, id).await? else { return Ok(None) };
+        if state_of(&row) != JobState::Queued {
+            return Ok(None);
+        }
+        row.held = None;
+        row.threads = i64::try_from(given.threads).ok();
+        row.memory_bytes = i64::try_from(given.memory_bytes).ok();
+        row.needed_bytes = i64::try_from(given.disk_bytes).ok();
+        row.resource_note.clone_from(&given.note);
         job_stages::clear(&mut tx, job_id(&row)?).await?;
         transition(&mut tx, &mut row, JobState::Running, None).await?;
         tx.commit().await?;
         self.hub.announce();
         Ok(Some(row))
+    }
+
+    /// Notes what a waiting job waits for besides its turn.
+    pub(super) async fn hold(&self, id: Uuid, hold: Hold) -> Result<(), StoreError> {
+        let mut tx = self.store.db.write().await?;
+        let Some(mut row) = jobs::find(&mut *tx, id).await? else { return Ok(()) };
+        if state_of(&row) == JobState::Queued && row.held.as_deref() != Some(hold.as_str()) {
+            tracing::warn!(job = %id, waits_for = hold.as_str(), "a job can't start yet");
+            row.held = Some(hold.as_str().to_owned());
+            jobs::update_state(&mut tx, &row).await?;
+            tx.commit().await?;
+            self.hub.announce();
+        }
+        Ok(())
+    }
+
+    /// Whether something that makes room may be tried once more: the disk is so full that not even that could be written down, and
+    /// the ballast was there to be given up.
+    fn made_room(&self, error: &JobsError) -> bool {
+        matches!(error, JobsError::Store(error) if error.is_disk_full()) && self.store.drop_ballast()
     }
 
     /// Where every waiting job stands, by its id, when `lanes` jobs run at once.
@@ -310,6 +357,13 @@ impl Jobs {
     /// # Errors
     /// [`JobsError::NotActive`] for a job that succeeded or failed.
     pub async fn cancel(&self, id: Uuid) -> Result<JobRow, JobsError> {
+        match self.try_cancel(id).await {
+            Err(error) if self.made_room(&error) => self.try_cancel(id).await,
+            other => other,
+        }
+    }
+
+    async fn try_cancel(&self, id: Uuid) -> Result<JobRow, JobsError> {
         let mut tx = self.store.db.write().await?;
         let mut row = jobs::find(&mut *tx, id).await?.ok_or(JobsError::JobNotFound)?;
         match state_of(&row) {
@@ -358,6 +412,13 @@ impl Jobs {
     /// # Errors
     /// [`JobsError::Running`].
     pub async fn delete(&self, id: Uuid) -> Result<(), JobsError> {
+        match self.try_delete(id).await {
+            Err(error) if self.made_room(&error) => self.try_delete(id).await,
+            other => other,
+        }
+    }
+
+    async fn try_delete(&self, id: Uuid) -> Result<(), JobsError> {
         let mut tx = self.store.db.write().await?;
         let row = jobs::find(&mut *tx, id).await?.ok_or(JobsError::JobNotFound)?;
         if state_of(&row) == JobState::Running {
@@ -374,6 +435,13 @@ impl Jobs {
     /// # Errors
     /// [`StoreError::DatasetInUse`].
     pub async fn delete_dataset(&self, id: Uuid) -> Result<(), JobsError> {
+        match self.try_delete_dataset(id).await {
+            Err(error) if self.made_room(&error) => self.try_delete_dataset(id).await,
+            other => other,
+        }
+    }
+
+    async fn try_delete_dataset(&self, id: Uuid) -> Result<(), JobsError> {
         let mut tx = self.store.db.write().await?;
         if jobs::use_of_dataset(&mut tx, id).await?.0 {
             return Err(StoreError::DatasetInUse.into());

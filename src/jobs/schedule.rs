@@ -10,6 +10,7 @@ use std::collections::{BTreeMap, VecDeque};
 use serde::Serialize;
 
 use super::eta::Eta;
+use super::resources::Hold;
 
 /// By what factor a run may be off from what the rates of other runs say.
 const RATE_SPREAD: f64 = 1.5;
@@ -27,6 +28,8 @@ pub struct Waiting {
     pub seq: i64,
     /// How much there is to do.
     pub size: Size,
+    /// What it waits for besides its turn.
+    pub held: Option<Hold>,
 }
 
 /// What the time of a run goes by.
@@ -121,6 +124,8 @@ pub struct QueuePlace {
     pub position: usize,
     /// Seconds until it starts; none when a run ahead can't be told.
     pub starts_in_s: Option<Eta>,
+    /// What it waits for besides its turn: `disk_full` or `memory`.
+    pub held: Option<Hold>,
     /// Seconds until it is done.
     #[serde(skip)]
     pub done_in_s: Option<Eta>,
@@ -141,6 +146,8 @@ pub fn places(ordered: &[Waiting], lanes: usize, running: &[Option<Eta>], rates:
         let run = rates.forecast(job.size);
         let low = first(&free_low, |eta| eta.low);
         let high = first(&free_high, |eta| eta.high);
+        // When space or memory returns, nobody knows.
+        let (low, high) = if job.held.is_some() { (None, None) } else { (low, high) };
         let starts_in_s = low.zip(high).map(|(low, high)| Eta { low: low.1.min(high.1), high: high.1 });
         let done_in_s = starts_in_s.zip(run).map(|(start, run)| start.plus(run));
         if let Some((lane, _)) = low {
@@ -149,7 +156,7 @@ pub fn places(ordered: &[Waiting], lanes: usize, running: &[Option<Eta>], rates:
         if let Some((lane, _)) = high {
             free_high[lane] = free_high[lane].zip(run).map(|(free, run)| free.plus(run));
         }
-        places.push(QueuePlace { position: at + 1, starts_in_s, done_in_s });
+        places.push(QueuePlace { position: at + 1, starts_in_s, held: job.held, done_in_s });
     }
     places
 }
@@ -161,7 +168,7 @@ mod tests {
 
     fn job(id: &str, priority: i64, seq: i64) -> Waiting {
         let owner = (!id.starts_with('-')).then(|| id[..1].to_owned());
-        Waiting { id: id.to_owned(), owner, priority, seq, size: Size { images: 10.0, bytes: 1e6 } }
+        Waiting { id: id.to_owned(), owner, priority, seq, size: Size { images: 10.0, bytes: 1e6 }, held: None }
     }
 
     fn ids(ordered: &[Waiting]) -> Vec<&str> {

@@ -41,6 +41,10 @@ impl PipelineError {
             Self::InvalidOptions(_) => "invalid_options",
             Self::InvalidInput { .. } => "invalid_input",
             Self::Io { source, .. } if source.kind() == std::io::ErrorKind::StorageFull => "disk_full",
+            Self::Io { source, .. } if source.kind() == std::io::ErrorKind::QuotaExceeded => "disk_full",
+            Self::Io { source, .. } if source.raw_os_error() == Some(rustix::io::Errno::IO.raw_os_error()) => {
+                "disk_error"
+            }
             Self::Io { .. } => "io_error",
         }
     }

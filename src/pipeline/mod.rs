@@ -11,6 +11,7 @@ mod intake;
 mod localise;
 mod masks;
 mod measure;
+mod needs;
 mod options;
 mod ready_features;
 mod refine;
@@ -23,6 +24,7 @@ mod verdict;
 
 pub use context::{CancelFlag, Context, NoProgress, ProgressEvent, ProgressSink};
 pub use error::PipelineError;
+pub use needs::{Needs, estimate};
 pub use options::{CoarseOptions, IntakeOptions, KnownCamera, ReconstructionOptions, RefineOptions};
 pub use run::{RunPaths, reconstruct};
 pub use stage::{Stage, StageKey};

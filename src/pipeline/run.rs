@@ -30,7 +30,7 @@ pub struct RunPaths {
 }
 
 /// Bytes of features kept in memory at most; more are read back from disk when needed.
-const FEATURE_CACHE_BYTES: usize = 768 << 20;
+pub(super) const FEATURE_CACHE_BYTES: usize = 768 << 20;
 
 /// Runs the pipeline on its own pool of `context.threads` threads and writes every output. That no model was found is not an
 /// error: the report says why.

@@ -19,7 +19,8 @@ pub(crate) fn temporary_in(folder: &Path) -> io::Result<NamedTempFile> {
 pub(crate) fn write_atomic(path: &Path, scratch: &Path, parts: &[&[u8]]) -> io::Result<()> {
     let mut file = temporary_in(scratch)?;
     for part in parts {
-        file.write_all(part)?;
+        // Not through the temporary file itself, which hides the system's error in one of its own.
+        file.as_file_mut().write_all(part)?;
     }
     file.as_file().sync_all()?;
     file.persist(path).map_err(|failed| failed.error)?;

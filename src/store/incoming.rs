@@ -51,7 +51,8 @@ impl StagedWriter {
     /// # Errors
     /// What the system said.
     pub fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
-        self.file.write_all(bytes)?;
+        // Not through the temporary file itself, which hides the system's error in one of its own.
+        self.file.as_file_mut().write_all(bytes)?;
         self.hash.update(bytes);
         self.size_bytes += bytes.len() as u64;
         Ok(())

@@ -9,6 +9,7 @@ mod incoming;
 mod layout;
 mod quota;
 mod resumable;
+mod space;
 mod token;
 
 use std::io;
@@ -23,10 +24,8 @@ pub use layout::DataDir;
 pub(crate) use quota::check as check_quota;
 pub use quota::{Quantity, Quota};
 pub use resumable::{Appender, NewUpload, UploadError, UploadKind};
+use space::Reservations;
 pub use token::{Scope, create_token, find_token};
-
-/// Space that no work may fill, so that deleting and the database always work.
-const RESERVE_BYTES: u64 = 32 << 20;
 
 /// The database and the files that belong to it.
 #[derive(Debug)]
@@ -35,6 +34,7 @@ pub struct Store {
     pub db: Db,
     /// Files.
     pub data: DataDir,
+    reservations: Reservations,
 }
 
 /// Why the store refused or failed.
@@ -73,10 +73,29 @@ impl StoreError {
         match self {
             Self::Io(error) => matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded),
             // SQLITE_FULL
-            Self::Db(sqlx::Error::Database(error)) => error.code().as_deref() == Some("13"),
+            Self::Db(sqlx::Error::Io(error)) => matches!(error.kind(), io::ErrorKind::StorageFull),
+            Self::Db(error) => sqlite_code(error) == Some(SQLITE_FULL),
             _ => false,
         }
     }
+
+    /// Whether the reason is that the disk does not do what it should.
+    pub fn is_disk_error(&self) -> bool {
+        match self {
+            Self::Io(error) => error.raw_os_error() == Some(rustix::io::Errno::IO.raw_os_error()),
+            Self::Db(error) => sqlite_code(error) == Some(SQLITE_IOERR),
+            _ => false,
+        }
+    }
+}
+
+/// Result codes of SQLite, without what its extended codes add.
+const SQLITE_IOERR: u32 = 10;
+const SQLITE_FULL: u32 = 13;
+
+fn sqlite_code(error: &sqlx::Error) -> Option<u32> {
+    let sqlx::Error::Database(error) = error else { return None };
+    error.code()?.parse::<u32>().ok().map(|code| code & 0xff)
 }
 
 impl Store {
@@ -87,7 +106,7 @@ impl Store {
     pub async fn open(root: &Path) -> Result<Self, StoreError> {
         let data = DataDir::open(root)?;
         let db = Db::open(&data.database()).await?;
-        Ok(Self { db, data })
+        Ok(Self { db, data, reservations: Reservations::default() })
     }
 
     /// Removes the folders of deleted jobs and datasets. What can't be removed stays on the list for the next time and is told to
@@ -108,29 +127,6 @@ impl Store {
                 }
                 Err(error) => tracing::warn!(folder, %error, "a deleted folder could not be removed"),
             }
-        }
-        Ok(())
-    }
-
-    /// Bytes that work may still fill: a reserve for deleting and for the database is kept back, and what open uploads have
-    /// announced counts as taken.
-    ///
-    /// # Errors
-    /// What the system or SQLite said.
-    pub async fn free_bytes(&self) -> Result<u64, StoreError> {
-        let space = rustix::fs::statvfs(self.data.root()).map_err(io::Error::from)?;
-        let free = space.f_bavail.saturating_mul(space.f_frsize);
-        let promised = db::uploads::outstanding_bytes(self.db.reader()).await?;
-        Ok(free.saturating_sub(RESERVE_BYTES).saturating_sub(u64::try_from(promised).unwrap_or(0)))
-    }
-
-    /// Fails unless there is room for so many bytes more.
-    ///
-    /// # Errors
-    /// [`io::ErrorKind::StorageFull`], or what the system or SQLite said.
-    pub async fn check_space(&self, bytes: u64) -> Result<(), StoreError> {
-        if self.free_bytes().await? < bytes {
-            return Err(io::Error::from(io::ErrorKind::StorageFull).into());
         }
         Ok(())
     }

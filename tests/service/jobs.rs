@@ -109,7 +109,7 @@ async fn failures_say_where_and_why() {
     let service = Service::start().await;
     for (mode, code, stage) in [
         ("panic", "panic", json!("coarse_match")),
-        ("io_error", "disk_full", json!("coarse_match")),
+        ("disk_error", "disk_error", json!("coarse_match")),
         ("no_model", "no_model", Value::Null),
     ] {
         let job = service.job(mode).await;

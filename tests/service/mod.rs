@@ -5,9 +5,9 @@
 pub mod contract;
 
 use std::collections::BTreeMap;
-use std::path::Path;
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use contract::Contract;
@@ -15,22 +15,24 @@ use multistage::config::ServerConfig;
 use multistage::formats::report::{ImageReport, ImageState, InputSummary, ModelReport, Report, Software};
 use multistage::http::Server;
 use multistage::jobs::Engine;
-use multistage::pipeline::{Context, PipelineError, ProgressEvent, RunPaths, Stage, StageKey};
+use multistage::pipeline::{Context, Needs, PipelineError, ProgressEvent, RunPaths, Stage, StageKey};
 use reqwest::multipart::{Form, Part};
 use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
 
 /// Stands for the pipeline. Its options say what happens:
-/// `{"mode": "quick" | "hang" | "panic" | "no_model" | "io_error"}`; `hang` waits in `coarse_match` until it is cancelled, unless
-/// an artifact says that it hung before. Names with `bad` are rejected, names with `lone` stay unregistered.
+/// `{"mode": "quick" | "hang" | "panic" | "no_model" | "disk_error" | "disk_full"}`; `hang` waits in `coarse_match` until it is cancelled,
+/// unless an artifact says that it hung before; `disk_full` finds the disk full so many times as `full` says. Names with `bad` are rejected, names with `lone` stay unregistered.
 #[derive(Default)]
 pub struct FakeEngine {
     pub runs: AtomicUsize,
+    pub full: AtomicUsize,
+    pub needs: Mutex<Needs>,
 }
 
 impl Engine for FakeEngine {
     fn validate(&self, options: &Value) -> Result<(), Vec<String>> {
-        let known = ["quick", "hang", "panic", "no_model", "io_error"];
+        let known = ["quick", "hang", "panic", "no_model", "disk_error", "disk_full"];
         let mut errors = Vec::new();
         for (name, value) in options.as_object().into_iter().flatten() {
             match name.as_str() {
@@ -40,6 +42,10 @@ impl Engine for FakeEngine {
             }
         }
         if errors.is_empty() { Ok(()) } else { Err(errors) }
+    }
+
+    fn needs(&self, _: &[PathBuf], _: &Value) -> Result<Needs, PipelineError> {
+        Ok(*self.needs.lock().expect("no test panics with it"))
     }
 
     fn run(&self, paths: &RunPaths, options: &Value, context: &Context) -> Result<Report, PipelineError> {
@@ -56,7 +62,12 @@ impl Engine for FakeEngine {
             tell(ProgressEvent::StageProgress { stage, done: 2, total: 4 });
             match (mode, stage.stage) {
                 ("panic", Stage::CoarseMatch) => panic!("the fake engine was told to"),
-                ("io_error", Stage::CoarseMatch) => {
+                ("disk_error", Stage::CoarseMatch) => {
+                    let source = std::io::Error::from_raw_os_error(5);
+                    return Err(PipelineError::Io { stage: stage.stage, path: "x".into(), source });
+                }
+                ("disk_full", Stage::CoarseMatch) if self.full.load(Ordering::SeqCst) > 0 => {
+                    self.full.fetch_sub(1, Ordering::SeqCst);
                     let source = std::io::Error::from(std::io::ErrorKind::StorageFull);
                     return Err(PipelineError::Io { stage: stage.stage, path: "x".into(), source });
                 }

@@ -46,6 +46,16 @@ pub struct JobRow {
     pub priority: i64,
     /// The token it belongs to.
     pub owner_token: Option<String>,
+    /// Bytes on disk that a run takes, as estimated.
+    pub needed_bytes: Option<i64>,
+    /// Memory that a run takes, as estimated.
+    pub memory_bytes: Option<i64>,
+    /// Threads of the latest attempt.
+    pub threads: Option<i64>,
+    /// Why it could not have all.
+    pub resource_note: Option<String>,
+    /// What it waits for besides its turn.
+    pub held: Option<String>,
 }
 
 /// What a new job is made of.
@@ -84,6 +94,8 @@ pub struct QueuedRow {
     pub images: i64,
     /// Their bytes.
     pub size_bytes: i64,
+    /// What it waits for besides its turn.
+    pub held: Option<String>,
     /// When the latest attempt started.
     pub started_ms: Option<i64>,
     /// When it came to its end.
@@ -93,7 +105,7 @@ pub struct QueuedRow {
 /// What the columns of a [`QueuedRow`] are.
 macro_rules! queued_columns {
     () => {
-        "SELECT id, owner_token, priority, seq, started_ms, finished_ms,
+        "SELECT id, owner_token, priority, seq, held, started_ms, finished_ms,
          (SELECT COUNT(*) FROM job_images WHERE job_id = jobs.id) AS images,
          (SELECT COALESCE(SUM(size_bytes), 0) FROM job_images WHERE job_id = jobs.id) AS size_bytes FROM jobs "
     };
@@ -173,7 +185,7 @@ pub async fn in_state(db: &mut SqliteConnection, state: &str) -> sqlx::Result<Ve
 pub async fn update_state(db: &mut SqliteConnection, job: &JobRow) -> sqlx::Result<()> {
     sqlx::query(
         "UPDATE jobs SET state = ?, cancel_requested = ?, started_ms = ?, finished_ms = ?, interruptions = ?, stages_finished = ?,
-         priority = ?, models = ?, error_stage = ?, error_code = ?, error_message = ? WHERE id = ?",
+         priority = ?, needed_bytes = ?, memory_bytes = ?, threads = ?, resource_note = ?, held = ?, models = ?, error_stage = ?, error_code = ?, error_message = ? WHERE id = ?",
     )
     .bind(&job.state)
     .bind(job.cancel_requested)
@@ -182,6 +194,11 @@ pub async fn update_state(db: &mut SqliteConnection, job: &JobRow) -> sqlx::Resu
     .bind(job.interruptions)
     .bind(job.stages_finished)
     .bind(job.priority)
+    .bind(job.needed_bytes)
+    .bind(job.memory_bytes)
+    .bind(job.threads)
+    .bind(&job.resource_note)
+    .bind(&job.held)
     .bind(&job.models)
     .bind(&job.error_stage)
     .bind(&job.error_code)

@@ -1,0 +1,125 @@
+//! Room on the disk: what work may still fill, what running jobs have reserved, and a ballast that deleting can fall back on.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io;
+use std::path::PathBuf;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use uuid::Uuid;
+
+use super::{DataDir, Store, StoreError, db};
+
+/// Space that no work may fill, so that deleting and the database always work.
+const RESERVE_BYTES: u64 = 32 << 20;
+/// Kept as a file, to be given up when the disk is full in spite of that: what other programs write, nobody here can bound.
+const BALLAST_BYTES: u64 = 8 << 20;
+/// With less free beside it, the ballast is not made again.
+const BALLAST_ABOVE_BYTES: u64 = 2 * RESERVE_BYTES;
+/// What a job has written is looked up so often.
+const LOOK_AGAIN: Duration = Duration::from_secs(5);
+
+/// What running jobs have reserved.
+#[derive(Debug, Default)]
+pub struct Reservations(Mutex<HashMap<Uuid, Reservation>>);
+
+#[derive(Clone, Copy, Debug)]
+struct Reservation {
+    bytes: u64,
+    written: u64,
+    looked: Option<Instant>,
+}
+
+impl Reservations {
+    fn all(&self) -> MutexGuard<'_, HashMap<Uuid, Reservation>> {
+        // A panic elsewhere can't leave the map half changed.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Bytes reserved and not written yet.
+    fn outstanding_bytes(&self, data: &DataDir) -> u64 {
+        let mut all = self.all();
+        for (job, reservation) in all.iter_mut() {
+            if reservation.looked.is_none_or(|at| at.elapsed() > LOOK_AGAIN) {
+                // A folder that changes while it is looked at counts as it was.
+                if let Ok(written) = DataDir::folder_bytes(&data.job(*job)) {
+                    reservation.written = written;
+                }
+                reservation.looked = Some(Instant::now());
+            }
+        }
+        all.values().map(|reservation| reservation.bytes.saturating_sub(reservation.written)).sum()
+    }
+}
+
+impl Store {
+    /// Keeps room for all that a job will have written in the end, until it is [released](Self::release_space).
+    pub fn reserve_space(&self, job: Uuid, bytes: u64) {
+        self.reservations.all().insert(job, Reservation { bytes, written: 0, looked: None });
+    }
+
+    /// Forgets what a job reserved.
+    pub fn release_space(&self, job: Uuid) {
+        self.reservations.all().remove(&job);
+    }
+
+    /// Bytes of the file system that anybody may still fill.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub fn disk_free_bytes(&self) -> io::Result<u64> {
+        let space = rustix::fs::statvfs(self.data.root()).map_err(io::Error::from)?;
+        Ok(space.f_bavail.saturating_mul(space.f_frsize))
+    }
+
+    /// Bytes that further work may fill: a reserve for deleting and for the database is kept back, and what open uploads have
+    /// announced and running jobs have reserved counts as taken.
+    ///
+    /// # Errors
+    /// What the system or SQLite said.
+    pub async fn free_bytes(&self) -> Result<u64, StoreError> {
+        let promised = db::uploads::outstanding_bytes(self.db.reader()).await?;
+        let taken =
+            [RESERVE_BYTES, u64::try_from(promised).unwrap_or(0), self.reservations.outstanding_bytes(&self.data)];
+        Ok(taken.into_iter().fold(self.disk_free_bytes()?, u64::saturating_sub))
+    }
+
+    /// Fails unless there is room for so many bytes more.
+    ///
+    /// # Errors
+    /// [`io::ErrorKind::StorageFull`], or what the system or SQLite said.
+    pub async fn check_space(&self, bytes: u64) -> Result<(), StoreError> {
+        if self.free_bytes().await? < bytes {
+            return Err(io::Error::from(io::ErrorKind::StorageFull).into());
+        }
+        Ok(())
+    }
+
+    fn ballast(&self) -> PathBuf {
+        self.data.root().join("ballast")
+    }
+
+    /// Makes the ballast where it is missing and there is room for it. Blocking.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub fn keep_ballast(&self) -> io::Result<()> {
+        let there = self.ballast().metadata().is_ok_and(|file| file.len() == BALLAST_BYTES);
+        if there || self.disk_free_bytes()? < BALLAST_ABOVE_BYTES {
+            return Ok(());
+        }
+        let file = File::create(self.ballast())?;
+        match rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, BALLAST_BYTES) {
+            Ok(()) => Ok(()),
+            // A file system that can't promise space; then there is no ballast.
+            Err(rustix::io::Errno::OPNOTSUPP) => std::fs::remove_file(self.ballast()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Gives up the ballast so that what frees space can be written down; whether there was any.
+    pub fn drop_ballast(&self) -> bool {
+        std::fs::remove_file(self.ballast()).is_ok()
+    }
+}
