@@ -10,5 +10,6 @@ pub mod ply;
 pub mod poses;
 pub mod report;
 pub mod report_html;
+pub mod stored_zip;
 
 pub use error::FormatError;

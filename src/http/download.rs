@@ -1,15 +1,21 @@
 //! Files out of the store: entity tags, conditional requests and ranges (RFC 9110).
 
-use std::io::SeekFrom;
-use std::path::Path;
+use std::future::ready;
+use std::io::{self, SeekFrom};
+use std::path::{Path, PathBuf};
 
 use axum::body::Body;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use tokio::io::{AsyncReadExt, AsyncSeekExt};
+use bytes::Bytes;
+use futures_util::stream::{self, Stream, StreamExt, TryStreamExt};
+use tokio::fs::File;
+use tokio::io::{AsyncReadExt, AsyncSeekExt, Take};
 use tokio_util::io::ReaderStream;
 
 use super::problem::{Code, Problem};
+use crate::formats::stored_zip::{Piece, StoredFile, StoredZip};
+use crate::store::db::job_outputs::JobOutputRow;
 
 /// Bytes read at a time.
 const CHUNK_BYTES: usize = 128 << 10;
@@ -30,6 +36,17 @@ enum Part {
     /// From, and how many bytes.
     Range(u64, u64),
     Unsatisfiable,
+}
+
+impl Part {
+    /// From, and how many bytes.
+    fn bounds(self, size_bytes: u64) -> Option<(u64, u64)> {
+        match self {
+            Self::Whole => Some((0, size_bytes)),
+            Self::Range(from, length) => Some((from, length)),
+            Self::Unsatisfiable => None,
+        }
+    }
 }
 
 /// A strong entity tag of a hash.
@@ -54,46 +71,111 @@ pub(super) async fn serve(headers: &HeaderMap, entity: Entity<'_>) -> Result<Res
     if not_modified(headers, &entity.etag) {
         return Ok(unchanged(&entity.etag));
     }
-    let (status, from, length) = match part(headers, &entity) {
-        Part::Whole => (StatusCode::OK, 0, entity.size_bytes),
-        Part::Range(from, length) => (StatusCode::PARTIAL_CONTENT, from, length),
-        Part::Unsatisfiable => {
-            let mut response = Problem::new(Code::RangeNotSatisfiable).into_response();
-            let range = format!("bytes */{}", entity.size_bytes);
-            response.headers_mut().insert(header::CONTENT_RANGE, text(&range));
-            return Ok(response);
-        }
+    let part = part(headers, &entity.etag, entity.size_bytes);
+    let Some((from, length)) = part.bounds(entity.size_bytes) else {
+        return Ok(unsatisfiable(entity.size_bytes));
     };
-    let mut file = tokio::fs::File::open(entity.file).await?;
+    let body = Body::from_stream(read(entity.file, from, length).await?);
+    Ok(answer(part, body, entity.size_bytes, &entity.etag, entity.media_type))
+}
+
+/// `size_bytes` bytes of a file from `from` on.
+async fn read(file: &Path, from: u64, size_bytes: u64) -> io::Result<ReaderStream<Take<File>>> {
+    let mut file = File::open(file).await?;
     if from > 0 {
         file.seek(SeekFrom::Start(from)).await?;
     }
-    let stream = ReaderStream::with_capacity(file.take(length), CHUNK_BYTES);
-    let mut response = (status, Body::from_stream(stream)).into_response();
+    Ok(ReaderStream::with_capacity(file.take(size_bytes), CHUNK_BYTES))
+}
+
+/// Files of a folder as one archive, or the part of it that is asked for. Nothing is read but what is sent.
+pub(super) fn serve_archive(headers: &HeaderMap, folder: &Path, outputs: &[JobOutputRow]) -> Response {
+    let mut names = blake3::Hasher::new();
+    let mut entries = Vec::with_capacity(outputs.len());
+    for output in outputs {
+        names.update(output.blake3.as_bytes()).update(output.path.as_bytes()).update(b"\n");
+        entries.push(StoredFile {
+            name: output.path.clone(),
+            size_bytes: u64::try_from(output.size_bytes).unwrap_or(0),
+            crc32: output.crc32.unwrap_or(0),
+        });
+    }
+    let etag = etag(&names.finalize().to_hex()[..32]);
+    if not_modified(headers, &etag) {
+        return unchanged(&etag);
+    }
+    let zip = StoredZip::new(&entries);
+    let part = part(headers, &etag, zip.size_bytes());
+    let Some((from, length)) = part.bounds(zip.size_bytes()) else { return unsatisfiable(zip.size_bytes()) };
+    let files: Vec<PathBuf> = outputs.iter().map(|output| folder.join(&output.path)).collect();
+    let pieces = stream::iter(zip.pieces(from, length)).then(move |piece| {
+        let file = match &piece {
+            Piece::File { index, .. } => files.get(*index).cloned().unwrap_or_default(),
+            Piece::Bytes(_) => PathBuf::new(),
+        };
+        async move {
+            Ok::<_, io::Error>(match piece {
+                Piece::Bytes(bytes) => stream::once(ready(Ok(Bytes::from(bytes)))).left_stream(),
+                Piece::File { from, size_bytes, .. } => {
+                    whole_or_error(read(&file, from, size_bytes).await?, size_bytes).right_stream()
+                }
+            })
+        }
+    });
+    answer(part, Body::from_stream(pieces.try_flatten()), zip.size_bytes(), &etag, "application/zip")
+}
+
+/// The same bytes, with an error in place of an end that comes too early: nobody must take a short archive for a whole one.
+fn whole_or_error(
+    bytes: impl Stream<Item = io::Result<Bytes>>,
+    size_bytes: u64,
+) -> impl Stream<Item = io::Result<Bytes>> {
+    let mut left = size_bytes;
+    let end = stream::once(ready(Ok(Bytes::new())));
+    bytes.chain(end).map(move |chunk| {
+        let chunk = chunk?;
+        if chunk.is_empty() && left > 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        left -= chunk.len() as u64;
+        Ok(chunk)
+    })
+}
+
+fn unsatisfiable(size_bytes: u64) -> Response {
+    let mut response = Problem::new(Code::RangeNotSatisfiable).into_response();
+    response.headers_mut().insert(header::CONTENT_RANGE, text(&format!("bytes */{size_bytes}")));
+    response
+}
+
+fn answer(part: Part, body: Body, size_bytes: u64, etag: &str, media_type: &'static str) -> Response {
+    let mut response = body.into_response();
+    let length = part.bounds(size_bytes).map_or(0, |(_, length)| length);
+    if let Part::Range(from, length) = part {
+        *response.status_mut() = StatusCode::PARTIAL_CONTENT;
+        let range = format!("bytes {from}-{}/{size_bytes}", from + length - 1);
+        response.headers_mut().insert(header::CONTENT_RANGE, text(&range));
+    }
     let headers = response.headers_mut();
-    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(entity.media_type));
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type));
     headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
-    headers.insert(header::ETAG, text(&entity.etag));
+    headers.insert(header::ETAG, text(etag));
     headers.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
-    if status == StatusCode::PARTIAL_CONTENT {
-        let range = format!("bytes {from}-{}/{}", from + length - 1, entity.size_bytes);
-        headers.insert(header::CONTENT_RANGE, text(&range));
-    }
-    Ok(response)
+    response
 }
 
 fn text(value: &str) -> HeaderValue {
     HeaderValue::from_str(value).unwrap_or(HeaderValue::from_static(""))
 }
 
-fn part(headers: &HeaderMap, entity: &Entity<'_>) -> Part {
+fn part(headers: &HeaderMap, etag: &str, size_bytes: u64) -> Part {
     let Some(range) = headers.get(header::RANGE).and_then(|value| value.to_str().ok()) else { return Part::Whole };
     // If-Range with anything but this very tag (a date, a weak tag): the client's part is of another file.
-    if headers.get(header::IF_RANGE).is_some_and(|tag| tag.as_bytes() != entity.etag.as_bytes()) {
+    if headers.get(header::IF_RANGE).is_some_and(|tag| tag.as_bytes() != etag.as_bytes()) {
         return Part::Whole;
     }
-    parse_range(range, entity.size_bytes)
+    parse_range(range, size_bytes)
 }
 
 /// One range in bytes. What can't be understood, other units and several ranges at once are ignored, as the standard allows.

@@ -11,7 +11,7 @@ use super::view::ModelSummary;
 use crate::formats::report::{ImageReport, ImageState, Report};
 use crate::store::db::job_images;
 use crate::store::db::job_outputs::JobOutputRow;
-use crate::store::{DataDir, StoreError, atomic};
+use crate::store::{Checksums, DataDir, StoreError, atomic};
 
 /// Makes the outputs that a run left in its partial folder durable and puts them in the place of older ones, all at once.
 /// Blocking.
@@ -20,13 +20,13 @@ pub(super) fn publish(data: &DataDir, job: Uuid) -> io::Result<Vec<JobOutputRow>
     let mut outputs = Vec::new();
     for path in atomic::list_files(&partial)? {
         let mut file = File::open(partial.join(&path))?;
-        let mut hash = blake3::Hasher::new();
-        let size_bytes = io::copy(&mut file, &mut hash)?;
+        let sums = Checksums::of(&mut file)?;
         file.sync_all()?;
         outputs.push(JobOutputRow {
             path,
-            size_bytes: i64::try_from(size_bytes).unwrap_or(i64::MAX),
-            blake3: hash.finalize().to_hex()[..32].to_owned(),
+            size_bytes: i64::try_from(sums.size_bytes).unwrap_or(i64::MAX),
+            blake3: sums.blake3,
+            crc32: Some(sums.crc32),
         });
     }
     atomic::sync_folders(&partial)?;

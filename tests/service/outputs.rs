@@ -2,6 +2,8 @@
 
 use std::io::Read;
 
+use multistage::store::db::job_outputs;
+use multistage::store::{DataDir, Db};
 use serde_json::{Value, json};
 
 use crate::service::Service;
@@ -92,6 +94,35 @@ async fn the_archive_holds_every_file() {
     let mut bytes = Vec::new();
     zip.by_name("ply/0/points.ply").unwrap().read_to_end(&mut bytes).unwrap();
     assert_eq!(bytes, points());
+
+    // Any part of it is that part, whatever file it falls into.
+    let (link, whole, etag) = (job["links"]["archive"].as_str().unwrap(), &answer.body, answer.header("etag"));
+    assert_eq!((answer.header("accept-ranges"), answer.header("content-length")), ("bytes", &*whole.len().to_string()));
+    for (from, to) in [(0, 1), (20, 5000), (whole.len() / 2, whole.len()), (whole.len() - 30, whole.len())] {
+        let part =
+            service.request("GET", link).header("range", format!("bytes={from}-{}", to - 1)).header("if-range", etag);
+        let part = service.send(part).await;
+        assert_eq!((part.status.as_u16(), part.body.len()), (206, to - from));
+        assert!(part.body == whole[from..to], "{from} to {to}");
+    }
+    let beyond = service.request("GET", link).header("range", format!("bytes={}-", whole.len()));
+    service.send(beyond).await.assert_problem(416, "range_not_satisfiable");
+    let again = service.send(service.request("GET", link).header("if-none-match", etag)).await;
+    assert_eq!(again.status.as_u16(), 304);
+
+    // What an earlier version made has no checksums yet.
+    let id = job["id"].as_str().unwrap().parse().unwrap();
+    let db = Db::open(&DataDir::database_in(service.data_dir())).await.unwrap();
+    let mut outputs = job_outputs::list(db.reader(), id).await.unwrap();
+    outputs.iter_mut().for_each(|output| output.crc32 = None);
+    let mut tx = db.write().await.unwrap();
+    job_outputs::replace(&mut tx, id, &outputs).await.unwrap();
+    tx.commit().await.unwrap();
+    assert!(service.get(link).await.body == *whole);
+
+    // A file that is gone breaks the archive off instead of shortening it.
+    std::fs::remove_file(service.data_dir().join("jobs").join(id.to_string()).join("out/ply/0/points.ply")).unwrap();
+    assert!(service.request("GET", link).send().await.unwrap().bytes().await.is_err());
 
     let failed = service.job("panic").await;
     service.wait_state(&failed, "failed").await;
