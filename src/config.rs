@@ -81,6 +81,8 @@ impl Default for ConnectionLimits {
 pub struct ServerConfig {
     /// Address to listen on; port 0 takes a free one.
     pub bind: SocketAddr,
+    /// Address where clients of NodeODM are served as well; none without.
+    pub nodeodm_bind: Option<SocketAddr>,
     /// Where everything is kept.
     pub data_dir: PathBuf,
     /// Worker threads of a job.
@@ -118,6 +120,7 @@ impl ServerConfig {
     pub fn new(data_dir: &Path) -> Self {
         Self {
             bind: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080),
+            nodeodm_bind: None,
             data_dir: data_dir.to_path_buf(),
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             memory_bytes: None,

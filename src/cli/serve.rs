@@ -23,6 +23,10 @@ pub(super) struct Args {
     /// Address to listen on; port 0 takes a free one. Beyond this machine, every request needs a token.
     #[arg(long, env = "MULTISTAGE_BIND", default_value = "127.0.0.1:8080")]
     bind: SocketAddr,
+    /// Serve clients of NodeODM (WebODM, CloudODM, PyODM) as well, at this address, such as 127.0.0.1:3000. Beyond this machine,
+    /// every request needs a token.
+    #[arg(long, env = "MULTISTAGE_NODEODM_BIND")]
+    nodeodm_bind: Option<SocketAddr>,
     /// Serve without tokens beyond this machine too: whoever reaches the address may do everything.
     #[arg(long, env = "MULTISTAGE_INSECURE", conflicts_with = "require_token")]
     insecure: bool,
@@ -79,6 +83,7 @@ impl Args {
     fn config(&self) -> ServerConfig {
         let mut config = ServerConfig::new(&self.data_dir);
         config.bind = self.bind;
+        config.nodeodm_bind = self.nodeodm_bind;
         config.threads = self.threads.map_or(config.threads, NonZeroUsize::get);
         config.parallel_jobs = self.max_parallel_jobs.get();
         config.memory_bytes = self.max_memory_bytes.map(NonZeroU64::get);
@@ -88,7 +93,9 @@ impl Args {
         let wanted = self.max_connections.map_or(connections.max_connections, NonZeroUsize::get);
         connections.max_connections = wanted.min(connections_that_fit());
         let access = &mut config.access;
-        access.token_required = self.require_token || !(self.insecure || self.bind.ip().is_loopback());
+        let on_this_machine =
+            self.bind.ip().is_loopback() && self.nodeodm_bind.is_none_or(|bind| bind.ip().is_loopback());
+        access.token_required = self.require_token || !(self.insecure || on_this_machine);
         access.cors_origins.clone_from(&self.cors_origins);
         access.requests_per_s = self.requests_per_s.map_or(access.requests_per_s, NonZeroU32::get);
         let uploads = &mut config.uploads;
@@ -141,6 +148,9 @@ async fn serve(config: ServerConfig) -> Result<(), Failure> {
         Server::start(config, Arc::new(PipelineEngine)).await.map_err(|error| Failure::Outside(error.to_string()))?;
     // For whoever started it and waits for the port.
     println!("listening on http://{}/", server.address);
+    if let Some(address) = server.nodeodm_address {
+        println!("NodeODM's interface at http://{address}/");
+    }
     std::io::stdout().flush().map_err(outside)?;
     tokio::select! {
         _ = interrupt.recv() => {}

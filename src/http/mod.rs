@@ -2,13 +2,16 @@
 
 mod access;
 mod connection;
+mod disposition;
 mod download;
 mod extract;
 mod metrics;
+mod nodeodm;
 mod page;
 mod problem;
 mod routes;
 mod server;
+mod submission;
 mod thumbnail;
 mod tus;
 mod unread;

@@ -137,6 +137,24 @@ impl Problem {
         self
     }
 
+    /// Which it is.
+    pub fn code(&self) -> Code {
+        self.code
+    }
+
+    /// Everything it says to people, in one line.
+    pub(super) fn sentence(&self) -> String {
+        let title = || self.code.status().canonical_reason().unwrap_or_default().to_owned();
+        let mut sentence = self.detail.clone().unwrap_or_else(title);
+        if !self.errors.is_empty() {
+            sentence = format!("{sentence}: {}", self.errors.join("; "));
+        }
+        match &self.path {
+            Some(path) => format!("{path}: {sentence}"),
+            None => sentence,
+        }
+    }
+
     /// Logs what happened inside and says no more than that it did.
     pub fn internal(error: &dyn std::fmt::Display) -> Self {
         tracing::error!(%error, "a request failed inside");

@@ -4,13 +4,14 @@
 //! synced side by side and committed in batches. A sender that stalls is given up, one that disconnects leaves nothing but
 //! photographs that sending again finds stored.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::multipart::{Field, MultipartError};
 use axum::extract::{FromRequest, Multipart, Request};
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::StatusCode;
 use bytes::Bytes;
 use futures_util::StreamExt;
 use tokio::sync::mpsc;
@@ -18,10 +19,11 @@ use tokio::task::{JoinHandle, spawn_blocking};
 use uuid::Uuid;
 
 use super::AppState;
+use super::disposition::file_name;
 use super::problem::{Code, Problem};
 use super::unread::Unread;
 use crate::config::UploadLimits;
-use crate::store::{ArchiveError, Committed, ImagePath, InvalidFileName, StagedFile, StagedWriter, Store, unpack};
+use crate::store::{ArchiveError, Committed, ImagePath, StagedFile, StagedWriter, Store, unpack};
 
 /// Files synced side by side and committed at once.
 const BATCH_FILES: usize = 32;
@@ -43,15 +45,43 @@ pub(super) struct Received {
     /// Files left out, and the first of their names.
     pub(super) ignored: usize,
     pub(super) ignored_names: Vec<String>,
-    /// The `name` part.
-    pub(super) name: Option<String>,
-    /// The `options` part.
-    pub(super) options: Option<String>,
-    /// The `priority` part.
-    pub(super) priority: Option<String>,
+    /// The text parts, by their names.
+    texts: BTreeMap<&'static str, String>,
+}
+
+/// Which parts a form may have besides photographs and archives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Form {
+    /// None.
+    Photographs,
+    /// A job's name, options and priority.
+    Job,
+    /// What clients of NodeODM send: archives come among the photographs, and parts that mean nothing here are passed over.
+    NodeOdm,
+}
+
+impl Form {
+    /// Text parts that mean something.
+    fn texts(self) -> &'static [&'static str] {
+        match self {
+            Self::Photographs => &[],
+            Self::Job => &["name", "options", "priority"],
+            Self::NodeOdm => &["name", "options", "zipurl"],
+        }
+    }
 }
 
 impl Received {
+    /// A text part, where it came and is not empty.
+    pub(super) fn text(&self, name: &str) -> Option<&str> {
+        self.texts.get(name).map(|text| text.trim()).filter(|text| !text.is_empty())
+    }
+
+    /// Whether any file came, of whatever kind.
+    pub(super) fn has_files(&self) -> bool {
+        self.stored + self.unchanged + self.ignored > 0
+    }
+
     fn ignore(&mut self, name: String) {
         self.ignored += 1;
         if self.ignored_names.len() < TOLD_NAMES {
@@ -121,27 +151,17 @@ impl Parts {
     }
 }
 
-/// Stores every photograph of a request in a dataset; the text parts are taken where `with_text` says so.
-pub(super) async fn receive(
-    state: &AppState,
-    parts: Parts,
-    dataset: Uuid,
-    with_text: bool,
-) -> Result<Received, Problem> {
+/// Stores every photograph of a request in a dataset.
+pub(super) async fn receive(state: &AppState, parts: Parts, dataset: Uuid, form: Form) -> Result<Received, Problem> {
     let unread = parts.unread.clone();
-    let received = receive_parts(state, parts, dataset, with_text).await;
+    let received = receive_parts(state, parts, dataset, form).await;
     if received.is_err() {
         unread.drop_rest().await;
     }
     received
 }
 
-async fn receive_parts(
-    state: &AppState,
-    mut parts: Parts,
-    dataset: Uuid,
-    with_text: bool,
-) -> Result<Received, Problem> {
+async fn receive_parts(state: &AppState, mut parts: Parts, dataset: Uuid, form: Form) -> Result<Received, Problem> {
     let incoming = state.jobs.store.data.incoming();
     let mut intake = Intake {
         store: Arc::clone(&state.jobs.store),
@@ -156,12 +176,17 @@ async fn receive_parts(
     };
     loop {
         let Some(field) = parts.next(intake.idle).await? else { break };
-        match field.name().unwrap_or("") {
+        let name = field.name().unwrap_or("");
+        if let Some(text) = form.texts().iter().find(|text| **text == name) {
+            let value = intake.text(field).await?;
+            intake.received.texts.insert(text, value);
+            continue;
+        }
+        match name {
+            "images" if form == Form::NodeOdm && is_archive(&field) => intake.archive(field).await?,
             "images" => intake.photograph(field).await?,
             "archive" => intake.archive(field).await?,
-            "name" if with_text => intake.received.name = Some(intake.text(field).await?),
-            "priority" if with_text => intake.received.priority = Some(intake.text(field).await?),
-            "options" if with_text => intake.received.options = Some(intake.text(field).await?),
+            _ if form == Form::NodeOdm => intake.pass_over(field).await?,
             other => {
                 let message = format!("no part {other:?} is known here");
                 return Err(Problem::new(Code::InvalidMultipart).detail(message));
@@ -174,11 +199,11 @@ async fn receive_parts(
 }
 
 impl Intake {
-    async fn photograph(&mut self, mut field: Field<'_>) -> Result<(), Problem> {
+    async fn photograph(&mut self, field: Field<'_>) -> Result<(), Problem> {
         let name = file_name(field.headers())?;
         let path = ImagePath::parse(&name).map_err(|why| Problem::file_name(&name, why))?;
         if !path.is_photograph() {
-            while self.chunk(&mut field).await?.is_some() {}
+            self.pass_over(field).await?;
             self.received.ignore(name);
             return Ok(());
         }
@@ -189,6 +214,11 @@ impl Intake {
         if self.batch.len() >= BATCH_FILES {
             self.commit().await?;
         }
+        Ok(())
+    }
+
+    async fn pass_over(&mut self, mut field: Field<'_>) -> Result<(), Problem> {
+        while self.chunk(&mut field).await?.is_some() {}
         Ok(())
     }
 
@@ -297,6 +327,12 @@ impl Intake {
     }
 }
 
+/// Whether a file of NodeODM's clients holds photographs; a `seed.zip` holds a project of another program.
+fn is_archive(field: &Field<'_>) -> bool {
+    let name = file_name(field.headers()).unwrap_or_default().to_ascii_lowercase();
+    name.ends_with(".zip") && !name.ends_with("seed.zip")
+}
+
 /// Waits for bytes of the sender, but not for ever.
 async fn in_time<T>(idle: Duration, read: impl Future<Output = Result<T, MultipartError>>) -> Result<T, Problem> {
     match tokio::time::timeout(idle, read).await {
@@ -306,96 +342,5 @@ async fn in_time<T>(idle: Duration, read: impl Future<Output = Result<T, Multipa
         }
         Ok(Err(error)) => Err(Problem::new(Code::InvalidMultipart).detail(error.body_text())),
         Err(_) => Err(Problem::new(Code::RequestTimeout).detail("no byte came for too long")),
-    }
-}
-
-/// The file name of a part, with its folders: `filename*` (RFC 8187) when there is one, else `filename`, where a backslash stands
-/// before a quote or another backslash only.
-fn file_name(headers: &HeaderMap) -> Result<String, Problem> {
-    let missing = || Problem::new(Code::InvalidMultipart).detail("a part `images` has no file name");
-    let value = headers.get(header::CONTENT_DISPOSITION).ok_or_else(missing)?;
-    let text = std::str::from_utf8(value.as_bytes())
-        .map_err(|_| Problem::file_name(&String::from_utf8_lossy(value.as_bytes()), InvalidFileName::Encoding))?;
-    let mut plain = None;
-    for (key, value) in parameters(text) {
-        match key.as_str() {
-            "filename*" => {
-                let encoded = value.splitn(3, '\'').nth(2).ok_or_else(missing)?.to_owned();
-                return percent_encoding::percent_decode_str(&encoded)
-                    .decode_utf8()
-                    .map(std::borrow::Cow::into_owned)
-                    .map_err(|_| Problem::file_name(&encoded, InvalidFileName::Encoding));
-            }
-            "filename" => plain = Some(value),
-            _ => {}
-        }
-    }
-    plain.ok_or_else(missing)
-}
-
-/// The parameters of a header value such as `form-data; name="a"; filename="b;c"`, keys in lower case.
-fn parameters(value: &str) -> Vec<(String, String)> {
-    let mut found = Vec::new();
-    let mut rest = value.find(';').map_or("", |at| &value[at + 1..]);
-    while let Some((key, after)) = rest.split_once('=') {
-        let key = key.trim_start_matches([';', ' ', '\t']).trim_end().to_ascii_lowercase();
-        let after = after.trim_start();
-        let (text, end) = match after.strip_prefix('"') {
-            Some(quoted) => {
-                let (text, end) = unquote(quoted);
-                (text, end + 1)
-            }
-            None => {
-                let end = after.find(';').unwrap_or(after.len());
-                (after[..end].trim_end().to_owned(), end)
-            }
-        };
-        found.push((key, text));
-        rest = &after[end..];
-    }
-    found
-}
-
-/// The text up to the closing quote, and where that ends.
-fn unquote(quoted: &str) -> (String, usize) {
-    let mut text = String::new();
-    let mut letters = quoted.char_indices().peekable();
-    while let Some((at, letter)) = letters.next() {
-        match letter {
-            '"' => return (text, at + 1),
-            '\\' if matches!(letters.peek(), Some((_, '"' | '\\'))) => text.extend(letters.next().map(|(_, c)| c)),
-            other => text.push(other),
-        }
-    }
-    (text, quoted.len())
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::*;
-
-    fn name_of(disposition: &str) -> Option<String> {
-        let mut headers = HeaderMap::new();
-        let value = header::HeaderValue::from_bytes(disposition.as_bytes()).unwrap();
-        headers.insert(header::CONTENT_DISPOSITION, value);
-        file_name(&headers).ok()
-    }
-
-    #[test]
-    fn file_names_come_as_every_client_writes_them() {
-        for (disposition, name) in [
-            (r#"form-data; name="images"; filename="a/b c.jpg""#, "a/b c.jpg"),
-            (r#"form-data; name=images; filename=a.jpg"#, "a.jpg"),
-            (r#"form-data; filename="x;y=\"z\".jpg"; name="images""#, r#"x;y="z".jpg"#),
-            (r#"form-data; name="images"; filename="石段.jpg""#, "石段.jpg"),
-            (r#"form-data; name="images"; filename="x.jpg"; filename*=utf-8''%E7%9F%B3%20a.jpg"#, "石 a.jpg"),
-            (r#"form-data; name="filename=evil"; filename="real.jpg""#, "real.jpg"),
-            (r#"form-data; name="images"; FileName="a\b.jpg""#, r"a\b.jpg"),
-        ] {
-            assert_eq!(name_of(disposition).as_deref(), Some(name), "{disposition}");
-        }
-        assert_eq!(name_of(r#"form-data; name="images""#), None);
-        assert_eq!(name_of(r#"form-data; filename*=broken"#), None);
     }
 }

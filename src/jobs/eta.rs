@@ -56,6 +56,28 @@ fn weight(stage: &JobStageRow) -> f64 {
     if later_round { weight * LATER_ROUND_SHARE } else { weight }
 }
 
+/// The share of a job's work that is done, from 0 to 1, each stage counted by its usual share of a run; 0 without a plan.
+pub fn share_done(stages: &[JobStageRow]) -> f64 {
+    let (mut done, mut all) = (0.0, 0.0);
+    for stage in stages {
+        let weight = weight(stage);
+        all += weight;
+        done += match stage.state.as_str() {
+            "done" | "reused" => weight,
+            "running" => weight * running_share(stage),
+            _ => 0.0,
+        };
+    }
+    if all > 0.0 { done / all } else { 0.0 }
+}
+
+fn running_share(stage: &JobStageRow) -> f64 {
+    match stage.total {
+        Some(total) if total > 0 => (stage.done as f64 / total as f64).clamp(0.0, 1.0),
+        _ => 0.0,
+    }
+}
+
 /// The guess for a running job; none while too little is done.
 pub fn estimate(stages: &[JobStageRow], now_ms: i64) -> Option<Eta> {
     // Weights, and the seconds they took.
@@ -70,10 +92,7 @@ pub fn estimate(stages: &[JobStageRow], now_ms: i64) -> Option<Eta> {
                 elapsed_s += stage.wall_s.unwrap_or(0.0);
             }
             "running" => {
-                let share = match stage.total {
-                    Some(total) if total > 0 => (stage.done as f64 / total as f64).clamp(0.0, 1.0),
-                    _ => 0.0,
-                };
+                let share = running_share(stage);
                 // The system's clock may jump.
                 let seconds = stage.started_ms.map_or(0.0, |start| (now_ms - start).max(0) as f64 / 1000.0);
                 done += weight * share;
@@ -152,6 +171,18 @@ mod tests {
         let stages = [stage("features", "done", 10, Some(10.0)), stage("coarse_match", "running", 5, None)];
         let eta = estimate(&stages, 60_000).unwrap();
         assert!(eta.low < 60.0 && 60.0 < eta.high && eta.high < 80.0, "{eta:?}");
+    }
+
+    #[test]
+    fn the_share_done_grows_from_nothing_to_all() {
+        let mut stages = [stage("features", "pending", 0, None), stage("export", "pending", 0, None)];
+        let mut shares = vec![share_done(&[]), share_done(&stages)];
+        assert_eq!(shares, [0.0, 0.0]);
+        for (at, state, done) in [(0, "running", 5), (0, "reused", 10), (1, "running", 5), (1, "done", 10)] {
+            (stages[at].state, stages[at].done) = (state.to_owned(), done);
+            shares.push(share_done(&stages));
+        }
+        assert!(shares[1..].is_sorted_by(|a, b| a < b) && shares.last() == Some(&1.0), "{shares:?}");
     }
 
     /// The second round of adding points hardly adds to what is left.

@@ -3,6 +3,7 @@
 //! The database is the only truth. Requests change it ([`Jobs`]), one executor takes jobs out of it ([`Executor`]), and start-up
 //! puts it in order ([`recover`]); between them goes nothing but wake-ups ([`Hub`]).
 
+mod again;
 mod engine;
 mod eta;
 mod executor;
@@ -18,7 +19,7 @@ mod state;
 pub mod view;
 
 pub use engine::{Engine, PipelineEngine};
-pub use eta::{Eta, estimate};
+pub use eta::{Eta, estimate, share_done};
 pub use executor::{Executor, Tick};
 pub use hub::Hub;
 pub use queue::{Jobs, JobsError, MAX_NAME_CHARS, MAX_PRIORITY, NewJob, state_of};

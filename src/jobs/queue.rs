@@ -190,6 +190,20 @@ pub(super) async fn remove_job(tx: &mut SqliteConnection, id: Uuid) -> Result<Op
     Ok(own)
 }
 
+/// Puts a job that is over into the queue once more, on the photographs that its dataset holds now; what it made is forgotten.
+pub(super) async fn queue_again(tx: &mut SqliteConnection, row: &mut JobRow) -> Result<(), JobsError> {
+    let id = job_id(row)?;
+    let dataset = row.dataset_id.parse().map_err(|_| JobsError::DatasetNotFound)?;
+    row.interruptions = 0;
+    row.stages_finished = 0;
+    row.models = None;
+    row.started_ms = None;
+    job_images::freeze(tx, id, dataset).await?;
+    job_stages::clear(tx, id).await?;
+    job_outputs::replace(tx, id, &[]).await?;
+    Ok(transition(tx, row, JobState::Queued, None).await?)
+}
+
 impl Jobs {
     /// One job.
     ///
@@ -388,19 +402,11 @@ impl Jobs {
     pub async fn resume(&self, id: Uuid) -> Result<JobRow, JobsError> {
         let mut tx = self.store.db.write().await?;
         let mut row = jobs::find(&mut *tx, id).await?.ok_or(JobsError::JobNotFound)?;
-        let state = state_of(&row);
-        if !state.may_become(JobState::Queued) || !state.is_final() {
-            return Err(JobsError::NotResumable(state));
+        match state_of(&row) {
+            JobState::Failed | JobState::Cancelled => {}
+            other => return Err(JobsError::NotResumable(other)),
         }
-        let dataset = row.dataset_id.parse().map_err(|_| JobsError::DatasetNotFound)?;
-        row.interruptions = 0;
-        row.stages_finished = 0;
-        row.models = None;
-        row.started_ms = None;
-        job_images::freeze(&mut tx, id, dataset).await?;
-        job_stages::clear(&mut tx, id).await?;
-        job_outputs::replace(&mut tx, id, &[]).await?;
-        transition(&mut tx, &mut row, JobState::Queued, None).await?;
+        queue_again(&mut tx, &mut row).await?;
         tx.commit().await?;
         self.hub.announce();
         self.hub.wake_executor();

@@ -51,8 +51,9 @@ impl JobState {
             Self::Queued => matches!(next, Self::Running | Self::Cancelled),
             // Back to the queue when the process ends under it.
             Self::Running => matches!(next, Self::Succeeded | Self::Failed | Self::Cancelled | Self::Queued),
-            Self::Failed | Self::Cancelled => next == Self::Queued,
-            Self::Succeeded => false,
+            // Once more, when somebody asks; taken back, it counts as cancelled.
+            Self::Succeeded | Self::Failed => matches!(next, Self::Queued | Self::Cancelled),
+            Self::Cancelled => next == Self::Queued,
         }
     }
 }
@@ -68,12 +69,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_kept_and_a_success_is_for_good() {
+    fn names_are_kept_and_what_is_over_starts_through_the_queue() {
         for state in JobState::ALL {
             assert_eq!(JobState::parse(state.as_str()), Some(state));
             assert!(!state.may_become(state));
-            assert!(!JobState::Succeeded.may_become(state));
             assert!(!state.is_final() || !state.may_become(JobState::Running), "only the queue starts a job");
+            assert!(!state.is_final() || !state.may_become(JobState::Succeeded), "only a run makes models");
         }
         assert_eq!(JobState::parse("done"), None);
     }

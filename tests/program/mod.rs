@@ -3,29 +3,38 @@
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 
 /// The running program; it ends with this value at the latest.
 pub struct Program {
     child: Child,
     /// Its address, without a slash at the end.
     pub base: String,
+    /// What it says after that.
+    pub output: BufReader<ChildStdout>,
 }
 
 impl Program {
     /// Starts it and waits until it listens.
     pub fn start(data_dir: &Path) -> Self {
+        Self::start_with(data_dir, &[])
+    }
+
+    /// The same with further arguments.
+    pub fn start_with(data_dir: &Path, arguments: &[&str]) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_multistage"))
             .args(["serve", "--bind", "127.0.0.1:0", "--threads", "2", "--data-dir"])
             .arg(data_dir)
+            .args(arguments)
             .env("RUST_LOG", "error")
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
         let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let mut output = BufReader::new(child.stdout.take().unwrap());
+        output.read_line(&mut line).unwrap();
         let base = line.trim().strip_prefix("listening on ").unwrap_or_else(|| panic!("{line:?}"));
-        Self { base: base.trim_end_matches('/').to_owned(), child }
+        Self { base: base.trim_end_matches('/').to_owned(), output, child }
     }
 
     /// As `kill -9`: no time for anything.

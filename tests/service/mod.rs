@@ -21,8 +21,9 @@ use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
 
 /// Stands for the pipeline. Its options say what happens:
-/// `{"mode": "quick" | "hang" | "panic" | "no_model" | "disk_error" | "disk_full"}`; `hang` waits in `coarse_match` until it is cancelled,
-/// unless an artifact says that it hung before; `disk_full` finds the disk full so many times as `full` says. Names with `bad` are rejected, names with `lone` stay unregistered.
+/// `{"mode": "quick" | "hang" | "panic" | "no_model" | "disk_error" | "disk_full"}`; `hang` waits in `coarse_match` until it is
+/// cancelled, unless an artifact says that it hung before; `disk_full` finds the disk full so many times as `full` says. Names with
+/// `bad` are rejected, names with `lone` stay unregistered, and one with `large` makes a large model.
 #[derive(Default)]
 pub struct FakeEngine {
     pub runs: AtomicUsize,
@@ -38,6 +39,7 @@ impl Engine for FakeEngine {
             match name.as_str() {
                 "mode" if value.as_str().is_some_and(|mode| known.contains(&mode)) => {}
                 "mode" => errors.push(format!("mode {value} is unknown")),
+                "intake" | "iterations" => {}
                 other => errors.push(format!("unknown option {other}")),
             }
         }
@@ -128,7 +130,8 @@ impl FakeEngine {
             ("report.html", b"<!doctype html><title>report</title>".to_vec()),
         ]);
         if with_model {
-            files.insert("ply/0/points.ply", (0..100_000u32).flat_map(u32::to_le_bytes).collect());
+            let size = if names.iter().any(|name| name.contains("large")) { 9_000_000 } else { 100_000 };
+            files.insert("ply/0/points.ply", (0..size).flat_map(u32::to_le_bytes).collect());
             files.insert("sparse/0/images.txt", b"# names: \xe7\x9f\xb3\n".to_vec());
         }
         for (path, bytes) in files {
@@ -232,6 +235,11 @@ impl Service {
         let base = format!("http://{}", server.address);
         let contract = Arc::new(Contract::load());
         Self { folder: Some(folder), server: Some(server), engine, base, contract, http: reqwest::Client::new() }
+    }
+
+    /// Where clients of NodeODM are served, with `nodeodm_bind` in the settings.
+    pub fn nodeodm(&self) -> String {
+        format!("http://{}", self.server.as_ref().expect("it runs").nodeodm_address.expect("it was asked for"))
     }
 
     pub fn data_dir(&self) -> &Path {

@@ -97,19 +97,11 @@ pub(super) async fn admit(
     mut request: Request,
     next: Next,
 ) -> Response {
-    let address = request.extensions().get::<ConnectInfo<SocketAddr>>().map(|info| info.0.ip());
-    let principal = match authenticate(&state, request.headers(), address).await {
+    let (sender, secret) = (Sender::of(&request), secret(request.headers()));
+    let principal = match identify(&state, sender, secret).await {
         Ok(principal) => principal,
         Err(refusal) => return refusal,
     };
-    let scope = match *request.method() {
-        Method::GET | Method::HEAD | Method::OPTIONS => Scope::Read,
-        _ => Scope::Submit,
-    };
-    if !principal.may(scope) {
-        let message = format!("the token lacks the scope `{}`", scope.as_str());
-        return Problem::new(Code::Forbidden).detail(message).into_response();
-    }
     // An address that is not UTF-8 leads nowhere.
     let Ok(params) = params else { return Problem::new(Code::NotFound).into_response() };
     for (name, value) in &params {
@@ -127,23 +119,48 @@ pub(super) async fn admit(
     next.run(request).await
 }
 
-async fn authenticate(state: &AppState, headers: &HeaderMap, address: Option<IpAddr>) -> Result<Principal, Response> {
+/// What a request says about its sender besides a secret.
+pub(super) struct Sender {
+    address: Option<IpAddr>,
+    /// What its method needs.
+    scope: Scope,
+}
+
+impl Sender {
+    pub(super) fn of(request: &Request) -> Self {
+        let scope = match *request.method() {
+            Method::GET | Method::HEAD | Method::OPTIONS => Scope::Read,
+            _ => Scope::Submit,
+        };
+        Self { address: request.extensions().get::<ConnectInfo<SocketAddr>>().map(|info| info.0.ip()), scope }
+    }
+}
+
+/// Who sends a request with this secret, once it is known that they may do what its method does.
+pub(super) async fn identify(state: &AppState, sender: Sender, secret: Option<String>) -> Result<Principal, Response> {
+    let principal = authenticate(state, secret, sender.address).await?;
+    if !principal.may(sender.scope) {
+        let message = format!("the token lacks the scope `{}`", sender.scope.as_str());
+        return Err(Problem::new(Code::Forbidden).detail(message).into_response());
+    }
+    Ok(principal)
+}
+
+async fn authenticate(
+    state: &AppState,
+    secret: Option<String>,
+    address: Option<IpAddr>,
+) -> Result<Principal, Response> {
     if !state.config.access.token_required {
         return Ok(Principal::Anybody);
     }
     if let Some(wait_s) = address.and_then(|address| state.rates.blocked_for_s(address)) {
         return Err(too_many(wait_s));
     }
-    let found = match secret(headers) {
-        Some(secret) => {
-            find_token(&state.jobs.store.db, &secret).await.map_err(|e| Problem::from(e).into_response())?
-        }
-        None => None,
-    };
+    let Some(secret) = secret else { return Err(unauthorized()) };
+    let found = find_token(&state.jobs.store.db, &secret).await.map_err(|e| Problem::from(e).into_response())?;
     let Some(token) = found else {
-        if headers.contains_key(header::AUTHORIZATION)
-            && let Some(address) = address
-        {
+        if let Some(address) = address {
             state.rates.failed(address);
         }
         return Err(unauthorized());
@@ -155,9 +172,14 @@ async fn authenticate(state: &AppState, headers: &HeaderMap, address: Option<IpA
     Ok(Principal::Token { id, scopes: Scope::parse_list(&token.scopes).unwrap_or_default() })
 }
 
-/// The secret a request brings.
-fn secret(headers: &HeaderMap) -> Option<String> {
-    let (scheme, value) = headers.get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
+/// The secret a request brings; one that can't be read is none that fits.
+pub(super) fn secret(headers: &HeaderMap) -> Option<String> {
+    let header = headers.get(header::AUTHORIZATION)?;
+    Some(read_secret(header).unwrap_or_default())
+}
+
+fn read_secret(header: &HeaderValue) -> Option<String> {
+    let (scheme, value) = header.to_str().ok()?.split_once(' ')?;
     if scheme.eq_ignore_ascii_case("bearer") {
         return Some(value.trim().to_owned());
     }

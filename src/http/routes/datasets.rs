@@ -11,7 +11,7 @@ use uuid::Uuid;
 use crate::http::access::Principal;
 use crate::http::extract::{DatasetId, Json, Page, Query, cut, media_type};
 use crate::http::problem::{Code, Problem};
-use crate::http::upload::{Parts, receive};
+use crate::http::upload::{Form, Parts, receive};
 use crate::http::{AppState, wire};
 use crate::jobs::MAX_NAME_CHARS;
 use crate::store::db::datasets::DatasetRow;
@@ -111,7 +111,7 @@ async fn add_images(
     }
     find(&state, id).await?;
     let parts = Parts::of(request).await?;
-    let received = receive(&state, parts, id, false).await?;
+    let received = receive(&state, parts, id, Form::Photographs).await?;
     let result = wire::UploadResult {
         stored: received.stored,
         unchanged: received.unchanged,

@@ -13,12 +13,13 @@ use uuid::Uuid;
 use crate::http::access::Principal;
 use crate::http::extract::{JobId, Json, Page, Query, cut, media_type};
 use crate::http::problem::{Code, Problem};
-use crate::http::upload::{Parts, Received, receive};
+use crate::http::submission::{Order, submit};
+use crate::http::upload::{Form, Parts, Received};
 use crate::http::{AppState, wire};
-use crate::jobs::{JobState, Jobs, NewJob, QueuePlace, state_of};
+use crate::jobs::{JobState, NewJob, QueuePlace, state_of};
 use crate::store::db::jobs::JobRow;
 use crate::store::db::tokens::Owned;
-use crate::store::db::{datasets, job_images, job_stages, jobs, now_ms};
+use crate::store::db::{job_images, job_stages, jobs};
 
 /// Quick requests.
 pub(in crate::http) fn router() -> Router<AppState> {
@@ -132,7 +133,14 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
     let row = match media_type(request.headers()).as_str() {
         "multipart/form-data" => {
             let parts = Parts::of(request).await?;
-            create_with_upload(&state, &principal, parts).await?
+            submit(&state, &principal, Uuid::now_v7(), parts, Form::Job, |received| {
+                Ok(Order {
+                    name: received.text("name").unwrap_or_default().to_owned(),
+                    options: options_of(received)?,
+                    priority: priority_of(received)?,
+                })
+            })
+            .await?
         }
         "application/json" => {
             let Json(body): Json<NewJobBody> = Json::from_request(request, &state).await?;
@@ -162,52 +170,14 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
     Ok(response)
 }
 
-/// The dataset of an upload: goes again unless the upload becomes a job, also when the sender leaves in the middle.
-struct OwnDataset {
-    jobs: Jobs,
-    dataset: Uuid,
-    kept: bool,
-}
-
-impl Drop for OwnDataset {
-    fn drop(&mut self) {
-        if !self.kept {
-            let (jobs, dataset) = (self.jobs.clone(), self.dataset);
-            tokio::spawn(async move {
-                if let Err(error) = jobs.delete_dataset(dataset).await {
-                    tracing::warn!(%dataset, %error, "what a broken upload left behind stays until the next start");
-                }
-            });
-        }
-    }
-}
-
-async fn create_with_upload(state: &AppState, principal: &Principal, parts: Parts) -> Result<JobRow, Problem> {
-    let (id, dataset) = (Uuid::now_v7(), Uuid::now_v7());
-    let mut tx = state.jobs.store.db.write().await?;
-    datasets::insert(&mut tx, dataset, "", now_ms(), Some(id), principal.owner()).await?;
-    tx.commit().await?;
-    let mut own = OwnDataset { jobs: state.jobs.clone(), dataset, kept: false };
-    let received = receive(state, parts, dataset, true).await?;
-    let options = options_of(&received)?;
-    let priority = priority_of(&received)?;
-    principal.check_priority(priority)?;
-    let name = received.name.unwrap_or_default();
-    let (ignored, owner_token) = (Some(received.ignored), principal.owner());
-    let row = state.jobs.enqueue(NewJob { id, name, dataset, options, ignored, priority, owner_token }).await?;
-    own.kept = true;
-    Ok(row)
-}
-
 fn priority_of(received: &Received) -> Result<i64, Problem> {
-    let text = received.priority.as_deref().map(str::trim).filter(|text| !text.is_empty()).unwrap_or("0");
+    let text = received.text("priority").unwrap_or("0");
     text.parse()
         .map_err(|_| Problem::new(Code::InvalidPriority).detail(format!("priority {text:?} is no whole number")))
 }
 
 fn options_of(received: &Received) -> Result<serde_json::Value, Problem> {
-    let text = received.options.as_deref().map(str::trim).filter(|text| !text.is_empty()).unwrap_or("{}");
-    let options: serde_json::Value = serde_json::from_str(text)
+    let options: serde_json::Value = serde_json::from_str(received.text("options").unwrap_or("{}"))
         .map_err(|error| Problem::new(Code::InvalidJson).detail(format!("options: {error}")))?;
     if !options.is_object() {
         return Err(Problem::new(Code::InvalidOptions).detail("the options must be a JSON object"));

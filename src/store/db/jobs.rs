@@ -209,6 +209,12 @@ pub async fn update_state(db: &mut SqliteConnection, job: &JobRow) -> sqlx::Resu
     Ok(())
 }
 
+/// Gives a job other options (JSON).
+pub async fn set_options(db: &mut SqliteConnection, id: Uuid, options: &str) -> sqlx::Result<()> {
+    sqlx::query("UPDATE jobs SET options = ? WHERE id = ?").bind(options).bind(id.to_string()).execute(db).await?;
+    Ok(())
+}
+
 /// Removes a job with all its rows.
 pub async fn delete(db: &mut SqliteConnection, id: Uuid) -> sqlx::Result<()> {
     sqlx::query("DELETE FROM jobs WHERE id = ?").bind(id.to_string()).execute(db).await?;

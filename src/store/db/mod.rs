@@ -12,6 +12,7 @@ pub mod job_images;
 pub mod job_outputs;
 pub mod job_stages;
 pub mod jobs;
+pub mod nodeodm_tasks;
 pub mod tokens;
 pub mod uploads;
 
