@@ -1,8 +1,12 @@
 //! Settings of the service's process.
 
+mod network;
+
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+
+pub use network::{InvalidNetwork, IpNetwork};
 
 use crate::store::ArchiveLimits;
 
@@ -76,6 +80,30 @@ impl Default for ConnectionLimits {
     }
 }
 
+/// How webhooks are called.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WebhookPolicy {
+    /// Addresses they may lead to besides those of the public internet.
+    pub allowed: Vec<IpNetwork>,
+    /// Time for one request, from the host's name to the end of the answer.
+    pub timeout: Duration,
+    /// Time until the second attempt; later ones wait longer.
+    pub first_pause: Duration,
+    /// Attempts until a delivery is given up; by the pauses, within two days.
+    pub max_attempts: u32,
+}
+
+impl Default for WebhookPolicy {
+    fn default() -> Self {
+        Self {
+            allowed: Vec::new(),
+            timeout: Duration::from_secs(10),
+            first_pause: Duration::from_secs(5),
+            max_attempts: 14,
+        }
+    }
+}
+
 /// Settings of `multistage serve`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ServerConfig {
@@ -101,6 +129,8 @@ pub struct ServerConfig {
     pub uploads: UploadLimits,
     /// How slow the other end may be.
     pub connections: ConnectionLimits,
+    /// How webhooks are called.
+    pub webhooks: WebhookPolicy,
     /// Time for a request other than uploads, downloads and event streams.
     pub request_timeout: Duration,
     /// An upload that brings no byte for so long is given up.
@@ -130,6 +160,7 @@ impl ServerConfig {
             access: AccessPolicy::default(),
             uploads: UploadLimits::default(),
             connections: ConnectionLimits::default(),
+            webhooks: WebhookPolicy::default(),
             request_timeout: Duration::from_secs(30),
             upload_idle_timeout: Duration::from_secs(30),
             upload_expiry: Duration::from_secs(7 * 24 * 3600),
@@ -150,6 +181,7 @@ impl ServerConfig {
                 max_file_bytes: 4 << 20,
                 archive: ArchiveLimits { max_entries: 2_000, max_file_bytes: 4 << 20, ..ArchiveLimits::default() },
             },
+            webhooks: WebhookPolicy { first_pause: Duration::from_millis(20), ..WebhookPolicy::default() },
             upload_idle_timeout: Duration::from_secs(5),
             keep_alive: Duration::from_millis(200),
             ..Self::new(data_dir)

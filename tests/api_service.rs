@@ -20,3 +20,5 @@ mod outputs;
 mod page;
 #[path = "service/queue.rs"]
 mod queue;
+#[path = "service/webhooks.rs"]
+mod webhooks;

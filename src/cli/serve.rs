@@ -13,7 +13,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tracing_subscriber::EnvFilter;
 
 use super::Failure;
-use crate::config::ServerConfig;
+use crate::config::{IpNetwork, ServerConfig};
 use crate::http::Server;
 use crate::jobs::PipelineEngine;
 
@@ -36,6 +36,9 @@ pub(super) struct Args {
     /// Origin of another site whose pages may use the service; may be given again.
     #[arg(long = "cors-origin", env = "MULTISTAGE_CORS_ORIGINS", value_delimiter = ',')]
     cors_origins: Vec<String>,
+    /// Address or network, such as 10.1.0.0/16, that webhooks may lead to besides the public internet; may be given again.
+    #[arg(long = "webhook-allow", env = "MULTISTAGE_WEBHOOK_ALLOW", value_delimiter = ',')]
+    webhook_allow: Vec<IpNetwork>,
     /// Requests a second that one token may send, on average [default: 500].
     #[arg(long, env = "MULTISTAGE_REQUESTS_PER_S")]
     requests_per_s: Option<NonZeroU32>,
@@ -92,6 +95,7 @@ impl Args {
         let connections = &mut config.connections;
         let wanted = self.max_connections.map_or(connections.max_connections, NonZeroUsize::get);
         connections.max_connections = wanted.min(connections_that_fit());
+        config.webhooks.allowed.clone_from(&self.webhook_allow);
         let access = &mut config.access;
         let on_this_machine =
             self.bind.ip().is_loopback() && self.nodeodm_bind.is_none_or(|bind| bind.ip().is_loopback());

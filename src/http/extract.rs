@@ -127,6 +127,18 @@ impl<S: Send + Sync> FromRequestParts<S> for UploadId {
     }
 }
 
+/// The webhook that an address names.
+pub(super) struct WebhookId(pub(super) Uuid);
+
+impl<S: Send + Sync> FromRequestParts<S> for WebhookId {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        let id = path_part(parts, state, "webhook_id").await.and_then(|id| id.parse().ok());
+        id.map(Self).ok_or_else(|| Problem::new(Code::WebhookNotFound))
+    }
+}
+
 /// The number of a photograph that an address names.
 pub(super) struct ImageNumber(pub(super) i64);
 

@@ -88,6 +88,7 @@ pub fn router(state: AppState) -> Router {
         .merge(routes::jobs::router())
         .merge(routes::datasets::router())
         .merge(routes::job_images::router())
+        .merge(routes::webhooks::router())
         .merge(routes::outputs::router())
         .merge(routes::service::router())
         .layer(timeout);

@@ -73,6 +73,7 @@ impl Server {
         tracing::info!(?machine, "jobs may take this much");
         let executor = Executor::new(jobs.clone(), machine, config.seed);
         let executor = tokio::spawn(executor.run(config.parallel_jobs, shutdown.clone()));
+        tokio::spawn(jobs.clone().call_webhooks(config.webhooks.clone(), shutdown.clone()));
         tokio::spawn(sweep(jobs.clone(), config.keep, config.upload_expiry, shutdown.clone()));
         let grace = config.shutdown_grace;
         let limits = config.connections;

@@ -6,6 +6,7 @@ use super::AppState;
 use super::access::Principal;
 use super::problem::Problem;
 use super::upload::{Form, Parts, Received, receive};
+use crate::jobs::webhooks::NewWebhook;
 use crate::jobs::{Jobs, NewJob};
 use crate::store::db::jobs::JobRow;
 use crate::store::db::{datasets, now_ms};
@@ -35,6 +36,7 @@ pub(super) struct Order {
     pub(super) name: String,
     pub(super) options: serde_json::Value,
     pub(super) priority: i64,
+    pub(super) webhook: Option<NewWebhook>,
 }
 
 /// Stores the photographs of a form in a dataset of their own and queues the job `id` on them, by what `read` takes from the form.
@@ -52,10 +54,11 @@ pub(super) async fn submit(
     tx.commit().await?;
     let mut own = OwnDataset { jobs: state.jobs.clone(), dataset, kept: false };
     let received = receive(state, parts, dataset, form).await?;
-    let Order { name, options, priority } = read(&received)?;
+    let Order { name, options, priority, webhook } = read(&received)?;
     principal.check_priority(priority)?;
     let (ignored, owner_token) = (Some(received.ignored), principal.owner());
-    let row = state.jobs.enqueue(NewJob { id, name, dataset, options, ignored, priority, owner_token }).await?;
+    let new = NewJob { id, name, dataset, options, ignored, priority, owner_token, webhook };
+    let row = state.jobs.enqueue(new).await?;
     own.kept = true;
     Ok(row)
 }

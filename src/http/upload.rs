@@ -54,7 +54,7 @@ pub(super) struct Received {
 pub(super) enum Form {
     /// None.
     Photographs,
-    /// A job's name, options and priority.
+    /// A job's name, options, priority and webhook.
     Job,
     /// What clients of NodeODM send: archives come among the photographs, and parts that mean nothing here are passed over.
     NodeOdm,
@@ -65,7 +65,7 @@ impl Form {
     fn texts(self) -> &'static [&'static str] {
         match self {
             Self::Photographs => &[],
-            Self::Job => &["name", "options", "priority"],
+            Self::Job => &["name", "options", "priority", "webhook"],
             Self::NodeOdm => &["name", "options", "zipurl"],
         }
     }

@@ -13,6 +13,7 @@ use crate::store::db::job_outputs::JobOutputRow;
 use crate::store::db::job_stages::JobStageRow;
 use crate::store::db::jobs::JobRow;
 use crate::store::db::now_ms;
+use crate::store::db::webhooks::{DeliveryRow, WebhookRow};
 
 /// The address of a job.
 pub(super) fn job_link(id: &str) -> String {
@@ -92,6 +93,7 @@ struct JobLinks {
     archive: String,
     report: String,
     dataset: String,
+    webhooks: String,
 }
 
 impl Job {
@@ -148,6 +150,7 @@ impl Job {
                 archive: format!("{link}/outputs.zip"),
                 report: format!("{link}/outputs/report.html"),
                 dataset: format!("/api/v1/datasets/{}", row.dataset_id),
+                webhooks: format!("{link}/webhooks"),
                 this: link,
             },
             id: row.id,
@@ -273,6 +276,54 @@ impl OutputList {
                     path: row.path,
                 })
                 .collect(),
+        }
+    }
+}
+
+#[derive(Serialize)]
+pub(super) struct WebhookList {
+    pub(super) webhooks: Vec<Webhook>,
+}
+
+/// A webhook without its secret.
+#[derive(Serialize)]
+pub(super) struct Webhook {
+    id: String,
+    url: String,
+    created_at: String,
+    deliveries: Vec<Delivery>,
+    links: SelfLink,
+}
+
+#[derive(Serialize)]
+struct Delivery {
+    event_id: i64,
+    state: String,
+    attempts: i64,
+    next_attempt_at: Option<String>,
+    last_attempt_at: Option<String>,
+    last_status: Option<i64>,
+    last_error: Option<String>,
+}
+
+impl Webhook {
+    pub(super) fn new(row: WebhookRow, deliveries: Vec<DeliveryRow>) -> Self {
+        let delivery = |row: DeliveryRow| Delivery {
+            event_id: row.event_id,
+            attempts: row.attempts,
+            // One that was never tried is tried at once.
+            next_attempt_at: (row.state == "pending" && row.next_ms > 0).then(|| time_text(row.next_ms)),
+            state: row.state,
+            last_attempt_at: row.last_ms.map(time_text),
+            last_status: row.last_status,
+            last_error: row.last_error,
+        };
+        Self {
+            links: SelfLink { this: format!("{}/webhooks/{}", job_link(&row.job_id), row.id) },
+            id: row.id,
+            url: row.url,
+            created_at: time_text(row.created_ms),
+            deliveries: deliveries.into_iter().map(delivery).collect(),
         }
     }
 }

@@ -17,6 +17,7 @@ mod retention;
 mod schedule;
 mod state;
 pub mod view;
+pub mod webhooks;
 
 pub use engine::{Engine, PipelineEngine};
 pub use eta::{Eta, estimate, share_done};

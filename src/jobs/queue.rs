@@ -10,9 +10,12 @@ use uuid::Uuid;
 use super::eta::{Eta, estimate};
 use super::schedule::{self, QueuePlace, Rates, Size, Turns, Waiting};
 use super::view::{ErrorView, StateEvent, time_text};
+use super::webhooks::{InvalidTarget, NewWebhook};
 use super::{Engine, Hold, Hub, JobState};
 use crate::store::db::jobs::{JobRow, NewJobRow, QueuedRow};
-use crate::store::db::{dataset_images, datasets, job_events, job_images, job_outputs, job_stages, jobs, now_ms};
+use crate::store::db::{
+    dataset_images, datasets, job_events, job_images, job_outputs, job_stages, jobs, now_ms, webhooks,
+};
 use crate::store::{Quantity, Store, StoreError, check_quota};
 
 /// Letters of a job's name.
@@ -50,6 +53,8 @@ pub struct NewJob {
     pub priority: i64,
     /// The token it belongs to.
     pub owner_token: Option<Uuid>,
+    /// Who is told of its changes of state, from the first on.
+    pub webhook: Option<NewWebhook>,
 }
 
 /// What a job is given when it starts.
@@ -86,6 +91,9 @@ pub enum JobsError {
     /// The engine refuses the options.
     #[error("invalid options: {}", .0.join("; "))]
     InvalidOptions(Vec<String>),
+    /// A webhook's address or secret is refused, or there are too many.
+    #[error("{0}")]
+    InvalidWebhook(String),
     /// It runs.
     #[error("the job is running; cancel it first")]
     Running,
@@ -101,6 +109,12 @@ pub enum JobsError {
     /// What the store said.
     #[error(transparent)]
     Store(#[from] StoreError),
+}
+
+impl From<InvalidTarget> for JobsError {
+    fn from(error: InvalidTarget) -> Self {
+        Self::InvalidWebhook(error.to_string())
+    }
 }
 
 impl From<sqlx::Error> for JobsError {
@@ -252,6 +266,9 @@ impl Jobs {
         jobs::insert(&mut tx, &row).await?;
         let owner = new.owner_token.map(|token| token.to_string());
         check_quota(&mut tx, owner.as_deref(), &[Quantity::Jobs]).await?;
+        if let Some(webhook) = &new.webhook {
+            webhooks::insert(&mut tx, &webhook.row(new.id)).await?;
+        }
         job_images::freeze(&mut tx, new.id, new.dataset).await?;
         let event = StateEvent { state: JobState::Queued, at: time_text(now), error: None };
         let data = serde_json::to_string(&event).map_err(|error| sqlx::Error::Encode(error.into()))?;

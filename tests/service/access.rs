@@ -45,6 +45,7 @@ fn addresses(service: &Service, job: &str, dataset: &str, upload: &str) -> Vec<(
         path.replace("{job_id}", job)
             .replace("{dataset_id}", dataset)
             .replace("{upload_id}", upload)
+            .replace("{webhook_id}", NOTHING)
             .replace("{n}", "0")
             .replace("{path}", "report.json")
     };

@@ -107,6 +107,9 @@ impl Contract {
                 "maxLength" => {
                     value.as_str().is_none_or(|s| s.chars().count() as u64 <= rule.as_u64().expect("maxLength"))
                 }
+                "minLength" => {
+                    value.as_str().is_none_or(|s| s.chars().count() as u64 >= rule.as_u64().expect("minLength"))
+                }
                 "format" => value.as_str().is_none_or(|text| match rule.as_str() {
                     Some("uuid") => text.parse::<uuid::Uuid>().is_ok(),
                     Some("date-time") => text.parse::<jiff::Timestamp>().is_ok(),

@@ -52,7 +52,7 @@ fn read(received: &Received) -> Result<Order, Problem> {
     }
     let name = received.text("name").map_or_else(|| format!("Task of {}", time_text(now_ms())), str::to_owned);
     let options = received.text("options").map_or(Value::Null, |text| Value::String(text.to_owned()));
-    Ok(Order { name, options: options::read(&options)?, priority: 0 })
+    Ok(Order { name, options: options::read(&options)?, priority: 0, webhook: None })
 }
 
 /// Whether a task with this id is a job already; an error when it is somebody else's.
@@ -146,6 +146,7 @@ async fn commit(
         ignored: None,
         priority: 0,
         owner_token: principal.owner(),
+        webhook: None,
     };
     match state.jobs.enqueue(new).await {
         Ok(_) => Ok(named(id)),

@@ -10,6 +10,7 @@ use axum::routing::{get, post};
 use serde::Deserialize;
 use uuid::Uuid;
 
+use super::webhooks::WebhookBody;
 use crate::http::access::Principal;
 use crate::http::extract::{JobId, Json, Page, Query, cut, media_type};
 use crate::http::problem::{Code, Problem};
@@ -127,6 +128,7 @@ struct NewJobBody {
     #[serde(default)]
     priority: i64,
     options: Option<serde_json::Map<String, serde_json::Value>>,
+    webhook: Option<WebhookBody>,
 }
 
 async fn create(State(state): State<AppState>, principal: Principal, request: Request) -> Result<Response, Problem> {
@@ -138,6 +140,7 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
                     name: received.text("name").unwrap_or_default().to_owned(),
                     options: options_of(received)?,
                     priority: priority_of(received)?,
+                    webhook: webhook_of(received)?.map(|webhook| webhook.check(&state)).transpose()?,
                 })
             })
             .await?
@@ -154,6 +157,7 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
                 ignored: None,
                 priority: body.priority,
                 owner_token: principal.owner(),
+                webhook: body.webhook.map(|webhook| webhook.check(&state)).transpose()?,
             };
             state.jobs.enqueue(new).await?
         }
@@ -183,4 +187,9 @@ fn options_of(received: &Received) -> Result<serde_json::Value, Problem> {
         return Err(Problem::new(Code::InvalidOptions).detail("the options must be a JSON object"));
     }
     Ok(options)
+}
+
+fn webhook_of(received: &Received) -> Result<Option<WebhookBody>, Problem> {
+    let invalid = |error| Problem::new(Code::InvalidJson).detail(format!("webhook: {error}"));
+    received.text("webhook").map(|text| serde_json::from_str(text).map_err(invalid)).transpose()
 }

@@ -7,3 +7,4 @@ pub(super) mod jobs;
 pub(super) mod outputs;
 pub(super) mod service;
 pub(super) mod uploads;
+pub(super) mod webhooks;

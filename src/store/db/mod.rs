@@ -15,6 +15,7 @@ pub mod jobs;
 pub mod nodeodm_tasks;
 pub mod tokens;
 pub mod uploads;
+pub mod webhooks;
 
 use std::path::Path;
 use std::sync::OnceLock;
