@@ -53,6 +53,11 @@ fn every_code_is_documented_and_every_documented_code_is_there() {
 }
 
 #[test]
+fn every_example_is_as_its_schema_says() {
+    assert!(Contract::load().check_examples() >= 9);
+}
+
+#[test]
 fn operation_names_are_unique_and_path_parameters_declared() {
     let contract = Contract::load();
     let mut names = BTreeSet::new();

@@ -20,7 +20,7 @@ if ! cmp -s tests/requirements.txt .venv/ready; then
     echo "setup: making .venv with the packages of tests/requirements.txt"
     rm -rf .venv
     { python3 -m venv .venv && .venv/bin/pip install -q --disable-pip-version-check -r tests/requirements.txt &&
-      .venv/bin/python -c 'import numpy, pycolmap, pyodm, tusclient' && cp tests/requirements.txt .venv/ready; } ||
+      .venv/bin/python -c 'import numpy, openapi_python_client, pycolmap, pyodm, schemathesis, tusclient' && cp tests/requirements.txt .venv/ready; } ||
       echo "setup: .venv could not be made (Debian: python3-venv); checks by independent programs will be skipped"
   else
     echo "setup: no python3; checks by independent programs will be skipped"

@@ -42,6 +42,9 @@ pub(super) struct Args {
     /// Requests a second that one token may send, on average [default: 500].
     #[arg(long, env = "MULTISTAGE_REQUESTS_PER_S")]
     requests_per_s: Option<NonZeroU32>,
+    /// Wrong tokens a minute that one address may send before it is refused for a while [default: 10].
+    #[arg(long, env = "MULTISTAGE_WRONG_TOKENS_PER_MIN")]
+    wrong_tokens_per_min: Option<NonZeroU32>,
     /// Directory that keeps photographs, jobs and models; one process at a time may use it.
     #[arg(long, env = "MULTISTAGE_DATA_DIR", default_value = "./multistage-data")]
     data_dir: PathBuf,
@@ -102,6 +105,7 @@ impl Args {
         access.token_required = self.require_token || !(self.insecure || on_this_machine);
         access.cors_origins.clone_from(&self.cors_origins);
         access.requests_per_s = self.requests_per_s.map_or(access.requests_per_s, NonZeroU32::get);
+        access.failures_per_min = self.wrong_tokens_per_min.map_or(access.failures_per_min, NonZeroU32::get);
         let uploads = &mut config.uploads;
         uploads.max_upload_bytes = self.max_upload_bytes.map_or(uploads.max_upload_bytes, NonZeroU64::get);
         uploads.archive.max_total_bytes = uploads.max_upload_bytes;

@@ -69,7 +69,11 @@ impl Page {
     pub(super) fn number_or(&self, start: i64) -> Result<i64, Problem> {
         match &self.cursor {
             None => Ok(start),
-            Some(cursor) => cursor.parse().map_err(|_| Problem::new(Code::InvalidQuery).detail("no such cursor")),
+            // A sign would be read as one of a number, and one of no list.
+            Some(cursor) if cursor.bytes().all(|byte| byte.is_ascii_digit()) => {
+                cursor.parse().map_err(|_| Problem::new(Code::InvalidQuery).detail("cursor: there is none like that"))
+            }
+            Some(_) => Err(Problem::new(Code::InvalidQuery).detail("cursor: there is none like that")),
         }
     }
 

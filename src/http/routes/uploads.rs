@@ -29,7 +29,7 @@ pub(in crate::http) fn router() -> Router<AppState> {
         .route("/api/v1/uploads", post(create).options(describe))
         .route(
             "/api/v1/uploads/{upload_id}",
-            head(show).patch(change).delete(remove).post(overridden).options(describe),
+            head(show).patch(change).delete(remove).post(overridden).options(describe_one),
         )
         .layer(from_fn(tus::negotiate))
 }
@@ -67,6 +67,10 @@ async fn describe(State(state): State<AppState>) -> Response {
         (axum::http::HeaderName::from_static("tus-max-size"), HeaderValue::from(state.config.uploads.max_file_bytes)),
     ];
     (StatusCode::NO_CONTENT, headers).into_response()
+}
+
+async fn describe_one(state: State<AppState>, UploadId(_): UploadId) -> Response {
+    describe(state).await
 }
 
 async fn create(State(state): State<AppState>, principal: Principal, request: Request) -> Result<Response, Problem> {
