@@ -38,7 +38,7 @@ pub(super) fn pack_group(rows: &[&Descriptor; GROUP_ROWS], lines: &mut [Line; QU
             }
         }
     }
-    *biases = rows.map(|row| bias(row));
+    *biases = rows.map(bias);
 }
 
 /// The query's bytes as signed ones, four to an integer that is broadcast to all rows.
