@@ -3,8 +3,10 @@
 //! Exit status: 0 done (for `reconstruct`: a model was made); 1 something outside failed, such as a full disk; 2 bad
 //! arguments or input; 3 the photographs gave no model; 130 interrupted.
 
+mod backup;
 mod cleanup;
 mod demo;
+mod doctor;
 mod evaluate;
 mod model_poses;
 mod options;
@@ -31,6 +33,10 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Copy the service's directory while it runs.
+    Backup(backup::Args),
+    /// Look whether the service's directory is whole.
+    Doctor(doctor::Args),
     /// Remove what nobody has used for long.
     Cleanup(cleanup::Args),
     /// Make a model of the photographs in a folder.
@@ -74,6 +80,8 @@ impl Failure {
 /// Parses the arguments, runs the command, and says how it went.
 pub fn run() -> ExitCode {
     let result = match Cli::parse().command {
+        Command::Backup(args) => backup::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Cleanup(args) => cleanup::run(&args),
         Command::Reconstruct(args) => reconstruct::run(args),
         Command::Demo(args) => demo::run(&args),

@@ -3,11 +3,13 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use axum::http::StatusCode;
 
-use crate::jobs::JobState;
+use super::problem::Code;
+use crate::jobs::{JobState, StageSums, Sums};
 
 /// What the process counts.
 #[derive(Debug)]
@@ -17,6 +19,20 @@ pub struct Metrics {
     responses: [AtomicU64; 5],
     upload_bytes: AtomicU64,
     upload_images: AtomicU64,
+    /// By the problem's code.
+    problems: Mutex<BTreeMap<&'static str, u64>>,
+}
+
+/// What is read from elsewhere for the figures.
+pub(super) struct Readings {
+    /// Jobs by state.
+    pub(super) jobs: BTreeMap<String, i64>,
+    /// Seconds that the longest waiting job has waited; none when nothing waits.
+    pub(super) oldest_wait_s: Option<f64>,
+    /// What jobs took.
+    pub(super) sums: Sums,
+    /// Room on the disk, where it tells.
+    pub(super) disk_free_bytes: Option<u64>,
 }
 
 impl Default for Metrics {
@@ -26,6 +42,7 @@ impl Default for Metrics {
             responses: Default::default(),
             upload_bytes: AtomicU64::new(0),
             upload_images: AtomicU64::new(0),
+            problems: Mutex::default(),
         }
     }
 }
@@ -39,14 +56,25 @@ impl Metrics {
         }
     }
 
+    /// A problem was the answer.
+    pub(super) fn refused(&self, code: Code) {
+        *self.problems().entry(code.as_str()).or_default() += 1;
+    }
+
+    fn problems(&self) -> MutexGuard<'_, BTreeMap<&'static str, u64>> {
+        // A panic elsewhere can't leave the counts half changed.
+        self.problems.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// An upload was stored.
     pub(super) fn uploaded(&self, bytes: u64, images: usize) {
         self.upload_bytes.fetch_add(bytes, Ordering::Relaxed);
         self.upload_images.fetch_add(images as u64, Ordering::Relaxed);
     }
 
-    /// Everything as text, with the jobs per state.
-    pub(super) fn text(&self, jobs: &BTreeMap<String, i64>) -> String {
+    /// Everything as text.
+    pub(super) fn text(&self, readings: &Readings) -> String {
+        let Readings { jobs, oldest_wait_s, sums, disk_free_bytes } = readings;
         let mut text = String::new();
         let mut family = |name: &str, kind: &str, help: &str, samples: &[(String, String)]| {
             // Writing into a string can't fail.
@@ -77,6 +105,43 @@ impl Metrics {
             })
             .collect();
         family("multistage_jobs", "gauge", "Jobs by state.", &states);
+        let wait_s = plain(format!("{:.3}", oldest_wait_s.unwrap_or(0.0)));
+        family(
+            "multistage_queue_oldest_wait_seconds",
+            "gauge",
+            "Time that the longest waiting job has waited.",
+            &wait_s,
+        );
+        let labelled = |label: &str, counts: &mut dyn Iterator<Item = (&str, u64)>| -> Vec<(String, String)> {
+            counts.map(|(name, count)| (format!("{{{label}=\"{name}\"}}"), count.to_string())).collect()
+        };
+        let ended = labelled("state", &mut sums.ended.iter().map(|(state, count)| (*state, *count)));
+        family("multistage_job_runs_total", "counter", "Runs by the state that they left the job in.", &ended);
+        let failed = labelled("code", &mut sums.failed.iter().map(|(code, count)| (code.as_str(), *count)));
+        family("multistage_job_errors_total", "counter", "Failed runs by their error.", &failed);
+        let of_stages = |value: fn(&StageSums) -> String| -> Vec<_> {
+            sums.stages.iter().map(|(stage, sums)| (format!("{{stage=\"{stage}\"}}"), value(sums))).collect()
+        };
+        let runs = of_stages(|sums| sums.runs.to_string());
+        family("multistage_stage_runs_total", "counter", "Stages that ran to their end.", &runs);
+        let wall_s = of_stages(|sums| format!("{:.3}", sums.wall_s));
+        family("multistage_stage_wall_seconds_total", "counter", "Wall-clock time of stages.", &wall_s);
+        let cpu_s = of_stages(|sums| format!("{:.3}", sums.cpu_s));
+        family("multistage_stage_cpu_seconds_total", "counter", "CPU time of stages.", &cpu_s);
+        let reused = plain(sums.stages_reused.to_string());
+        family("multistage_stages_reused_total", "counter", "Stages whose results were re-used.", &reused);
+        let images = plain(sums.images.to_string());
+        family("multistage_job_images_total", "counter", "Photographs of runs that came to a report.", &images);
+        let seconds = plain(format!("{:.3}", sums.seconds));
+        family("multistage_job_seconds_total", "counter", "Wall-clock time of those runs.", &seconds);
+        let rate = if sums.seconds > 0.0 { sums.images as f64 / sums.seconds } else { 0.0 };
+        let rate = plain(format!("{rate:.4}"));
+        family("multistage_job_images_per_second", "gauge", "Photographs per second of those runs.", &rate);
+        let problems = labelled("code", &mut self.problems().iter().map(|(code, count)| (*code, *count)));
+        family("multistage_http_problems_total", "counter", "Problems answered, by code.", &problems);
+        if let Some(free) = disk_free_bytes {
+            family("multistage_disk_free_bytes", "gauge", "Room on the disk.", &plain(free.to_string()));
+        }
         text
     }
 }

@@ -126,6 +126,7 @@ async fn account(State(state): State<AppState>, request: Request, next: Next) ->
     let status = response.status();
     if status.is_client_error() || status.is_server_error() {
         let problem = response.extensions_mut().remove().unwrap_or_else(|| Problem::of_status(status));
+        state.metrics.refused(problem.code());
         problem.write(&mut response, &request_id);
     }
     if let Ok(value) = HeaderValue::from_str(&request_id) {

@@ -121,6 +121,11 @@ impl Problem {
         Self { code, detail: None, errors: Vec::new(), path: None }
     }
 
+    /// Its code.
+    pub fn code(&self) -> Code {
+        self.code
+    }
+
     /// Adds a sentence for people.
     pub fn detail(mut self, detail: impl ToString) -> Self {
         self.detail = Some(detail.to_string());

@@ -67,7 +67,7 @@ impl Server {
             None => None,
         };
         let nodeodm_address = nodeodm.as_ref().map(|(_, address)| *address);
-        let jobs = Jobs { store: Arc::clone(&store), hub: Arc::new(Hub::default()), engine };
+        let jobs = Jobs { store: Arc::clone(&store), hub: Arc::new(Hub::default()), engine, figures: Arc::default() };
         let shutdown = CancellationToken::new();
         let machine = Machine::detect(config.threads, config.memory_bytes);
         tracing::info!(?machine, "jobs may take this much");
@@ -127,6 +127,11 @@ async fn sweep(jobs: Jobs, keep: Option<Duration>, upload_expiry: Duration, shut
                 Ok(stale) => tracing::info!(?stale, "jobs and datasets were kept long enough and are removed"),
                 Err(error) => tracing::warn!(%error, "what was kept long enough could not be removed"),
             }
+        }
+        match store.data.empty_quarantine() {
+            Ok(0) => {}
+            Ok(removed) => tracing::info!(removed, "what was in quarantine long enough is removed"),
+            Err(error) => tracing::warn!(%error, "the quarantine could not be emptied"),
         }
         if let Err(error) = store.keep_ballast() {
             tracing::warn!(%error, "the ballast could not be made");

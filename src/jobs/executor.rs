@@ -20,6 +20,7 @@ use sqlx::SqliteConnection;
 use tokio::sync::{Mutex, oneshot, watch};
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
+use tracing::Instrument;
 use uuid::Uuid;
 
 use super::progress::{Progress, Recorder, WRITE_INTERVAL, WatchSink};
@@ -139,7 +140,12 @@ impl Executor {
     pub async fn tick(&self) -> Result<Tick, StoreError> {
         let Some((row, choice)) = self.next().await? else { return Ok(Tick::Idle) };
         let id = job_id(&row)?;
-        tracing::info!(job = %id, ?choice, "job started");
+        self.run_claimed(id, row, choice).instrument(tracing::info_span!("job", %id)).await
+    }
+
+    /// Runs a claimed job to its end.
+    async fn run_claimed(&self, id: Uuid, row: JobRow, choice: Choice) -> Result<Tick, StoreError> {
+        tracing::info!(?choice, "job started");
         let outcome = match choice {
             Choice::Refuse(message) => {
                 Outcome::Failed(ErrorView { stage: None, code: "not_enough_memory".to_owned(), message })
@@ -150,6 +156,9 @@ impl Executor {
             },
         };
         self.jobs.hub.ended(id);
+        if let Outcome::Report(report) = &outcome {
+            self.jobs.figures.reported(report);
+        }
         let state = self.finish(id, outcome).await;
         self.desk.lock().await.running.remove(&id);
         self.jobs.store.release_space(id);
@@ -157,7 +166,7 @@ impl Executor {
             // Another may have waited for what it had.
             self.jobs.hub.wake_executor();
         }
-        tracing::info!(job = %id, %state, "job ended");
+        tracing::info!(%state, "job ended");
         Ok(Tick::Ran(id, state))
     }
 
@@ -310,7 +319,9 @@ impl Executor {
         let options = serde_json::from_str(&row.options).unwrap_or_default();
         let engine = Arc::clone(&self.jobs.engine);
         let (sender, receiver) = oneshot::channel();
+        let span = tracing::Span::current();
         std::thread::Builder::new().name(format!("job-{id}")).stack_size(STACK_BYTES).spawn(move || {
+            let _entered = span.entered();
             let run = AssertUnwindSafe(|| engine.run(&paths, &options, &context));
             let result = std::panic::catch_unwind(run);
             drop(context);
@@ -381,8 +392,10 @@ impl Executor {
             Outcome::Failed(error) => (JobState::Failed, Some(error.clone())),
         };
         let error = error.filter(|_| state == JobState::Failed);
+        let code = error.as_ref().map(|error| error.code.clone());
         transition(&mut tx, &mut row, state, error).await?;
         tx.commit().await?;
+        self.jobs.figures.ended(state, code.as_deref());
         Ok(state)
     }
 

@@ -11,7 +11,7 @@ use super::eta::{Eta, estimate};
 use super::schedule::{self, QueuePlace, Rates, Size, Turns, Waiting};
 use super::view::{ErrorView, StateEvent, time_text};
 use super::webhooks::{InvalidTarget, NewWebhook};
-use super::{Engine, Hold, Hub, JobState};
+use super::{Engine, Figures, Hold, Hub, JobState};
 use crate::store::db::jobs::{JobRow, NewJobRow, QueuedRow};
 use crate::store::db::{
     dataset_images, datasets, job_events, job_images, job_outputs, job_stages, jobs, now_ms, webhooks,
@@ -34,6 +34,8 @@ pub struct Jobs {
     pub hub: Arc<Hub>,
     /// Who runs them.
     pub engine: Arc<dyn Engine>,
+    /// What they took.
+    pub figures: Arc<Figures>,
 }
 
 /// What to reconstruct.

@@ -10,6 +10,8 @@
 //! jobs/<id>/thumbnails/...   made on demand
 //! uploads/<id>               bytes of a resumable upload
 //! incoming/...               other uploads on their way; emptied at start
+//! quarantine/...             what belonged to nobody; goes after a week
+//! ballast                    given up when the disk is full, so that deleting can be written down
 //! trash/...                  folders being deleted; emptied at start
 //! ```
 

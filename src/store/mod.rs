@@ -3,7 +3,9 @@
 mod archive;
 mod artifacts;
 pub(crate) mod atomic;
+mod backup;
 pub mod db;
+mod doctor;
 mod file_name;
 mod incoming;
 mod layout;
@@ -18,7 +20,9 @@ use std::path::Path;
 
 pub use archive::{ArchiveError, ArchiveLimits, unpack};
 pub use artifacts::ArtifactStore;
+pub use backup::{BackedUp, back_up};
 pub use db::Db;
+pub use doctor::{Finding, examine};
 pub use file_name::{ImagePath, InvalidFileName};
 pub use incoming::{Committed, StagedFile, StagedWriter};
 pub use layout::DataDir;
@@ -117,6 +121,9 @@ impl Store {
     /// # Errors
     /// What SQLite said.
     pub async fn discard_deleted(&self) -> Result<(), StoreError> {
+        if db::discards::is_held(self.db.reader(), db::now_ms()).await? {
+            return Ok(());
+        }
         for folder in db::discards::list(self.db.reader()).await? {
             let data = self.data.clone();
             let place = data.root().join(&folder);

@@ -362,7 +362,7 @@ fn stage(file: &Path, scratch: &Path, path: ImagePath, size_bytes: u64) -> io::R
 }
 
 /// Feeds what is written into a hash.
-struct HashWriter<'a>(&'a mut Sha256);
+pub(super) struct HashWriter<'a>(pub(super) &'a mut Sha256);
 
 impl Write for HashWriter<'_> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {

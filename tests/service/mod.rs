@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use contract::Contract;
 use multistage::config::ServerConfig;
-use multistage::formats::report::{ImageReport, ImageState, InputSummary, ModelReport, Report, Software};
+use multistage::formats::report::{ImageReport, ImageState, InputSummary, ModelReport, Report, Software, StageReport};
 use multistage::http::Server;
 use multistage::jobs::Engine;
 use multistage::pipeline::{Context, Needs, PipelineError, ProgressEvent, RunPaths, Stage, StageKey};
@@ -119,7 +119,14 @@ impl FakeEngine {
             wall_s: 1.0,
             cpu_s: 1.0,
             peak_rss_bytes: None,
-            stages: Vec::new(),
+            stages: vec![StageReport {
+                name: "intake".into(),
+                iteration: None,
+                wall_s: 0.5,
+                cpu_s: 0.25,
+                reused: false,
+                counts: BTreeMap::new(),
+            }],
             models: if with_model { vec![model] } else { Vec::new() },
             images,
             look_alikes: Vec::new(),

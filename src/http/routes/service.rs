@@ -7,9 +7,10 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 
 use crate::http::extract::RestOfPath;
+use crate::http::metrics::Readings;
 use crate::http::problem::{Code, Problem};
 use crate::http::{AppState, page, wire};
-use crate::store::db::jobs;
+use crate::store::db::{jobs, now_ms};
 
 /// With less space left, no new work is taken.
 const LEAST_FREE_BYTES: u64 = 64 << 20;
@@ -52,9 +53,17 @@ async fn ready(State(state): State<AppState>) -> Result<Response, Problem> {
 }
 
 async fn metrics(State(state): State<AppState>) -> Result<Response, Problem> {
-    let jobs = jobs::count_by_state(state.jobs.store.db.reader()).await?;
+    let reader = state.jobs.store.db.reader();
+    let waiting = jobs::queue(reader, "queued").await?;
+    let oldest_ms = waiting.iter().map(|job| job.created_ms).min();
+    let readings = Readings {
+        jobs: jobs::count_by_state(reader).await?,
+        oldest_wait_s: oldest_ms.map(|since| (now_ms() - since).max(0) as f64 / 1000.0),
+        sums: state.jobs.figures.sums(),
+        disk_free_bytes: state.jobs.store.disk_free_bytes().ok(),
+    };
     let media_type = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
-    Ok((media_type, state.metrics.text(&jobs)).into_response())
+    Ok((media_type, state.metrics.text(&readings)).into_response())
 }
 
 async fn openapi() -> Response {

@@ -96,6 +96,8 @@ pub struct QueuedRow {
     pub size_bytes: i64,
     /// What it waits for besides its turn.
     pub held: Option<String>,
+    /// When it was made.
+    pub created_ms: i64,
     /// When the latest attempt started.
     pub started_ms: Option<i64>,
     /// When it came to its end.
@@ -105,7 +107,7 @@ pub struct QueuedRow {
 /// What the columns of a [`QueuedRow`] are.
 macro_rules! queued_columns {
     () => {
-        "SELECT id, owner_token, priority, seq, held, started_ms, finished_ms,
+        "SELECT id, owner_token, priority, seq, held, created_ms, started_ms, finished_ms,
          (SELECT COUNT(*) FROM job_images WHERE job_id = jobs.id) AS images,
          (SELECT COALESCE(SUM(size_bytes), 0) FROM job_images WHERE job_id = jobs.id) AS size_bytes FROM jobs "
     };

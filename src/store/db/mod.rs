@@ -7,6 +7,7 @@
 pub mod dataset_images;
 pub mod datasets;
 pub mod discards;
+pub mod inventory;
 pub mod job_events;
 pub mod job_images;
 pub mod job_outputs;

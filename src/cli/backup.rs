@@ -1,0 +1,39 @@
+//! `multistage backup`: a copy of the data directory, while the service runs.
+
+use std::path::PathBuf;
+
+use super::Failure;
+use crate::store::{DataDir, Db, back_up};
+
+/// Arguments of `multistage backup`.
+#[derive(Debug, clap::Args)]
+pub(super) struct Args {
+    /// The service's directory.
+    #[arg(long, env = "MULTISTAGE_DATA_DIR", default_value = "./multistage-data")]
+    data_dir: PathBuf,
+    /// Where the copy goes; an earlier copy there is brought up to date. To restore, serve the copy.
+    #[arg(long)]
+    to: PathBuf,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &Args) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::Outside(format!("can't start the runtime: {error}")))?;
+    runtime.block_on(copy(args))
+}
+
+async fn copy(args: &Args) -> Result<(), Failure> {
+    let outside = |error: &dyn std::fmt::Display| Failure::Outside(format!("{}: {error}", args.data_dir.display()));
+    let database = DataDir::database_in(&args.data_dir);
+    if !database.exists() {
+        return Err(Failure::Input(format!("{}: there is no data directory", args.data_dir.display())));
+    }
+    let db = Db::open(&database).await.map_err(|error| outside(&error))?;
+    let account = back_up(&db, &args.data_dir, &args.to).await.map_err(|error| outside(&error))?;
+    db.close().await;
+    println!("{} files of {} bytes and the database are in {}", account.files, account.bytes, args.to.display());
+    Ok(())
+}

@@ -1,0 +1,102 @@
+//! Databases of every earlier schema come up to date with all they hold.
+
+use std::path::{Path, PathBuf};
+
+use multistage::store::{DataDir, Db};
+use sqlx::SqlitePool;
+use sqlx::migrate::Migrator;
+use sqlx::sqlite::SqliteConnectOptions;
+
+use crate::service::Service;
+
+const DATASET: &str = "01999999-0000-7000-8000-00000000000d";
+const JOB: &str = "01999999-0000-7000-8000-00000000000a";
+const TOKEN: &str = "01999999-0000-7000-8000-00000000000b";
+
+fn migrations() -> Vec<PathBuf> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("migrations");
+    let mut files: Vec<_> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    files
+}
+
+/// A database as the first `count` migrations leave it, with a row in every table they make.
+async fn old_database(path: &Path, count: usize) {
+    let chosen = tempfile::tempdir().unwrap();
+    for file in &migrations()[..count] {
+        std::fs::copy(file, chosen.path().join(file.file_name().unwrap())).unwrap();
+    }
+    let options = SqliteConnectOptions::new().filename(path).create_if_missing(true).foreign_keys(true);
+    let pool = SqlitePool::connect_with(options).await.unwrap();
+    Migrator::new(chosen.path()).await.unwrap().run(&pool).await.unwrap();
+    let image = "'a.jpg', 5, 'cee8c5b5ba2b3d3ee0ebc5bfd5c4f0e1b4d9c1d6d2e1d4c1f0e1b4d9c1d6d2e1'";
+    let mut rows = vec![
+        format!("INSERT INTO datasets (id, seq, name, created_ms) VALUES ('{DATASET}', 1, 'old', 1000)"),
+        format!("INSERT INTO dataset_images (dataset_id, path, size_bytes, sha256) VALUES ('{DATASET}', {image})"),
+        format!(
+            "INSERT INTO jobs (id, seq, name, state, created_ms, started_ms, finished_ms, dataset_id, options, models)
+             VALUES ('{JOB}', 1, 'old job', 'succeeded', 1000, 2000, 3000, '{DATASET}', '{{}}', '[]')"
+        ),
+        format!(
+            "INSERT INTO job_stages (job_id, ord, name, state, done, counts) VALUES ('{JOB}', 0, 'intake', 'done', 1, '{{}}')"
+        ),
+        format!("INSERT INTO job_events (job_id, id, kind, data) VALUES ('{JOB}', 1, 'state', '{{}}')"),
+        format!(
+            "INSERT INTO job_images (job_id, n, path, size_bytes, sha256, state) VALUES ('{JOB}', 0, {image}, 'pending')"
+        ),
+        format!("INSERT INTO job_outputs (job_id, path, size_bytes, blake3) VALUES ('{JOB}', 'report.json', 2, 'ab')"),
+    ];
+    if count >= 2 {
+        rows.push(
+            "INSERT INTO uploads (id, created_ms, expires_ms, kind, metadata) VALUES ('u', 1, 99999999999999, 'partial', '')"
+                .to_owned(),
+        );
+    }
+    if count >= 3 {
+        rows.push(format!(
+            "INSERT INTO tokens (id, name, hash, scopes, created_ms) VALUES ('{TOKEN}', 'team', 'ff', 'read', 1)"
+        ));
+    }
+    for row in rows {
+        sqlx::query(sqlx::AssertSqlSafe(row)).execute(&pool).await.unwrap();
+    }
+    pool.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_earlier_schema_comes_up_to_date_with_its_rows() {
+    let all = migrations().len();
+    assert!(all >= 6, "the migrations were not found");
+    for count in 1..=all {
+        let folder = tempfile::tempdir().unwrap();
+        old_database(&DataDir::database_in(folder.path()), count).await;
+        let images = folder.path().join(format!("datasets/{DATASET}/images"));
+        std::fs::create_dir_all(&images).unwrap();
+        std::fs::write(images.join("a.jpg"), b"a.jpg").unwrap();
+        let service = Service::start_in(folder, |_| {}).await;
+        let job = service.get(&format!("/api/v1/jobs/{JOB}")).await.ok(200);
+        assert_eq!(
+            (&job["name"], &job["state"], &job["priority"]),
+            (&"old job".into(), &"succeeded".into(), &0.into())
+        );
+        assert_eq!(job["stages"][0]["name"], "intake");
+        let dataset = service.get(&format!("/api/v1/datasets/{DATASET}")).await.ok(200);
+        assert_eq!((&dataset["images"], &dataset["size_bytes"]), (&1.into(), &5.into()));
+        // New work on what is old.
+        let body = serde_json::json!({"dataset_id": DATASET});
+        let new = service.post_json("/api/v1/jobs", &body).await.ok(202);
+        service.wait_state(&new, "succeeded").await;
+        let folder = service.stop().await;
+        let db = Db::open(&DataDir::database_in(folder.path())).await.unwrap();
+        let verdict: String = sqlx::query_scalar("PRAGMA integrity_check").fetch_one(db.reader()).await.unwrap();
+        assert_eq!(verdict, "ok");
+        let loose: Vec<(String,)> =
+            sqlx::query_as("SELECT \"table\" FROM pragma_foreign_key_check").fetch_all(db.reader()).await.unwrap();
+        assert!(loose.is_empty(), "{loose:?}");
+        if count >= 3 {
+            let tokens = multistage::store::db::tokens::list(db.reader()).await.unwrap();
+            assert_eq!(tokens.iter().map(|token| token.name.as_str()).collect::<Vec<_>>(), ["team"]);
+        }
+        db.close().await;
+    }
+}
