@@ -369,27 +369,27 @@ async fn a_begun_task_outlives_the_program() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_task_that_is_never_committed_goes() {
-    let service = Service::start_in(tempfile::tempdir().unwrap(), |config| {
-        config.nodeodm_bind = Some(config.bind);
-        config.upload_expiry = Duration::ZERO;
-    })
-    .await;
+    let service = start().await;
     let client = Client::of(&service);
-    let id = client.begin(None).await["uuid"].as_str().unwrap().to_owned();
-    client.post(&format!("/task/new/upload/{id}"), photographs(["a.jpg"])).await;
-    let service = start_in(service.stop().await, false).await;
-    // Here nothing expires so soon.
-    assert_eq!(Client::of(&service).commit(&id).await["uuid"], id);
-    let kept = Client::of(&service).begin(None).await["uuid"].as_str().unwrap().to_owned();
-    let folder = service.stop().await;
-    let service = Service::start_in(folder, |config| config.upload_expiry = Duration::ZERO).await;
-    for _ in 0..100 {
-        if service.get("/api/v1/datasets").await.ok(200)["datasets"].as_array().unwrap().len() == 1 {
+    let mut begun = Vec::new();
+    for _ in 0..2 {
+        let id = client.begin(None).await["uuid"].as_str().unwrap().to_owned();
+        client.post(&format!("/task/new/upload/{id}"), photographs(["a.jpg"])).await;
+        begun.push(id);
+    }
+    assert_eq!(client.commit(&begun[0]).await["uuid"], begun[0]);
+    client.completed(&begun[0]).await;
+    let datasets =
+        async |service: &Service| service.get("/api/v1/datasets").await.ok(200)["datasets"].as_array().unwrap().len();
+    assert_eq!(datasets(&service).await, 2);
+    let service = Service::start_in(service.stop().await, |config| config.upload_expiry = Duration::ZERO).await;
+    for _ in 0..500 {
+        if datasets(&service).await == 1 {
             break;
         }
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     let service = start_in(service.stop().await, false).await;
-    assert!(error_of(&Client::of(&service).commit(&kept).await).contains("not found"));
-    assert_eq!(Client::of(&service).completed(&id).await["imagesCount"], 1);
+    assert!(error_of(&Client::of(&service).commit(&begun[1]).await).contains("not found"));
+    assert_eq!(Client::of(&service).completed(&begun[0]).await["imagesCount"], 1);
 }
