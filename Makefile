@@ -18,7 +18,7 @@ setup: page tests/page/node_modules/.package-lock.json
 # The page's third-party code, bundled into static/vendor.
 page: static/vendor/three.js
 
-static/vendor/three.js: static/node_modules/.package-lock.json static/three-entry.mjs static/vendor.mjs
+static/vendor/three.js: static/node_modules/.package-lock.json static/three-entry.mjs static/tus-entry.mjs static/vendor.mjs
 	cd static && npm run --silent vendor
 
 %/node_modules/.package-lock.json: %/package-lock.json

@@ -59,4 +59,6 @@ export const jobImages = (job, cursor, state, limit = 60) => request("GET", `${j
 export const jobOutputs = (job) => request("GET", job.links.outputs);
 export const jobReport = (job) => request("GET", `${job.links.outputs}/report.json`);
 export const createDataset = (name) => request("POST", `${API}/datasets`, { name });
+export const getDataset = (id) => request("GET", `${API}/datasets/${encodeURIComponent(id)}`);
+export const datasetImages = (dataset, cursor, limit = 1000) => request("GET", `${dataset.links.images}?${page(cursor, limit)}`);
 export const deleteDataset = (dataset) => request("DELETE", dataset.links.self);

@@ -138,18 +138,20 @@ function newJob() {
     const bar = h("progress", { max: 1, value: 0, "aria-label": "Upload" });
     const text = h("p", { class: "number" }, "Starting ...");
     const detail = h("p", { class: "muted small" });
+    const files = h("ul", { class: "under-way", "aria-label": "Files under way" });
     fill(panel,
-      h("h2", {}, `Uploading ${name || "pictures"}`), bar, text, detail,
+      h("h2", {}, `Uploading ${name || "pictures"}`), bar, text, detail, files,
       h("div", { class: "row" }, h("button", { type: "button", onclick: async () => { await upload?.cancel(); } }, "Stop the upload")));
     const began = performance.now();
-    const alreadySent = resumed?.sent ?? 0;
+    const sentBefore = resumed?.sent ?? 0;
     let told = 0;
-    const progress = ({ sent, total, files, waiting }) => {
+    const progress = ({ sent, kept, total, files: count, waiting, current }) => {
       bar.value = total > 0 ? sent / total : 1;
       text.textContent = `${bytes(sent)} of ${bytes(total)}`;
       const elapsed_s = (performance.now() - began) / 1000;
-      const rate = (sent - alreadySent) / elapsed_s;
-      detail.textContent = waiting ?? [`${plural(files, "file")} stored`, elapsed_s > 2 && rate > 0 && `${bytes(rate)}/s, ${timeLeft({ low: (total - sent) / rate, high: (total - sent) / rate })}`].filter(Boolean).join(" \u00b7 ");
+      const rate = (sent - Math.max(sentBefore, kept)) / elapsed_s;
+      fill(files, current.map((file) => h("li", {}, h("span", {}, file.path), h("progress", { max: Math.max(1, file.size), value: file.sent, "aria-label": file.path }))));
+      detail.textContent = waiting ?? [`${plural(count, "file")} stored`, kept > 0 && `${bytes(kept)} of an earlier visit`, elapsed_s > 2 && rate > 0 && `${bytes(rate)}/s, ${timeLeft({ low: (total - sent) / rate, high: (total - sent) / rate })}`].filter(Boolean).join(" \u00b7 ");
       const quarter = Math.floor((4 * sent) / Math.max(1, total));
       if (quarter > told) {
         told = quarter;
@@ -163,6 +165,7 @@ function newJob() {
       const dataset = await upload.run();
       const job = await upload.persist(() => createJob({ dataset_id: dataset.id, ...(name ? { name } : {}), options }));
       announce("Uploaded. The job is queued.");
+      upload.finish();
       upload = null;
       selection = new Selection();
       const watched = panel.isConnected;

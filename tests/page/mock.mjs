@@ -20,6 +20,7 @@ const VERDICTS = [
  */
 export async function startMock({ stage_ms = 300, fail = () => undefined, models = 1 } = {}) {
   const datasets = new Map();
+  const uploads = new Map();
   const jobs = new Map();
   const seen = new Map();
   const id = () => crypto.randomUUID();
@@ -73,6 +74,30 @@ export async function startMock({ stage_ms = 300, fail = () => undefined, models
     job.listeners.clear();
   }
 
+  /** As much of tus as a page needs: announce, ask, bring. */
+  function tus(request, response, path, body, problem) {
+    response.setHeader("tus-resumable", "1.0.0");
+    const bring = (upload) => {
+      upload.offset += body.length;
+      if (upload.offset === upload.length) datasets.get(upload.dataset).files.add(upload.path);
+      response.setHeader("upload-offset", upload.offset);
+    };
+    if (request.method === "POST") {
+      const metadata = Object.fromEntries(request.headers["upload-metadata"].split(",").map((pair) => {
+        const [key, value] = pair.split(" ");
+        return [key, Buffer.from(value, "base64").toString()];
+      }));
+      const upload = { id: id(), length: Number(request.headers["upload-length"]), offset: 0, ...metadata };
+      uploads.set(upload.id, upload);
+      bring(upload);
+      return response.setHeader("location", `/api/v1/uploads/${upload.id}`).writeHead(201).end();
+    }
+    const upload = uploads.get(path.split("/").pop());
+    if (!upload) return problem(404, "upload_not_found", "There is no such upload.");
+    if (request.method === "PATCH") bring(upload);
+    return response.setHeader("upload-length", upload.length).setHeader("upload-offset", upload.offset).writeHead(request.method === "PATCH" ? 204 : 200).end();
+  }
+
   const server = createServer(async (request, response) => {
     const url = new URL(request.url, "http://mock");
     const path = decodeURIComponent(url.pathname);
@@ -121,6 +146,7 @@ export async function startMock({ stage_ms = 300, fail = () => undefined, models
       for (const name of names) dataset.files.add(name);
       return json(200, { stored: dataset.files.size - before, unchanged: names.length - (dataset.files.size - before), ignored: [], dataset: datasetBody(dataset) });
     }
+    if (path.startsWith("/api/v1/uploads")) return tus(request, response, path, body, problem);
     if (path === "/api/v1/jobs") {
       if (request.method === "GET") return json(200, { jobs: [...jobs.values()].reverse().map(jobBody), next_cursor: null });
       const given = JSON.parse(body);

@@ -125,7 +125,7 @@ test("a folder can be dropped, and its sub-folders keep their names", { skip }, 
 
 test("an upload that is cut off goes on by itself and stores nothing twice", { skip }, () => onMock({
   stage_ms: 50,
-  fail: (method, path, nth) => (method === "POST" && path.endsWith("/images") ? ["drop", 503][nth - 1] : undefined),
+  fail: (method, path, nth) => (method === "POST" && path === "/api/v1/uploads" ? ["drop", 503][nth - 1] : undefined),
 }, async (page, mock) => {
   await choose(page);
   await page.getByRole("button", { name: "Upload and reconstruct" }).click();
@@ -148,7 +148,7 @@ test("a problem that won't pass is shown, and can be tried again", { skip }, () 
 
 test("an upload goes on while another job is looked at", { skip }, () => onMock({
   stage_ms: 50,
-  fail: (method, path, nth) => (method === "POST" && path.endsWith("/images") && nth > 1 && nth < 4 ? 503 : undefined),
+  fail: (method, path, nth) => (method === "POST" && path === "/api/v1/uploads" && nth > 6 && nth < 14 ? 503 : undefined),
 }, async (page, mock) => {
   const start = async () => {
     await choose(page);

@@ -1,17 +1,15 @@
 // The page on the real service: photographs in by the page, model on the canvas, files out.
 import assert from "node:assert/strict";
-import { spawn } from "node:child_process";
 import { existsSync } from "node:fs";
 import { mkdtemp, readFile, readdir, rm } from "node:fs/promises";
-import { createServer } from "node:net";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
 import { fileURLToPath } from "node:url";
 import { distinctColours, noBrowser, openBrowser, openPage } from "./browser.mjs";
+import { startService } from "./service.mjs";
 
 const PHOTOGRAPHS = fileURLToPath(new URL("../../../shared/datasets/bundler-et/images/", import.meta.url));
-const BINARY = process.env.MULTISTAGE_BIN ?? fileURLToPath(new URL("../../target/debug/multistage", import.meta.url));
 /** The photographs are small and few; a busy machine is slow. */
 const MODEL_TIMEOUT_MS = 240_000;
 
@@ -21,41 +19,17 @@ let browser;
 let service;
 let data;
 let url;
-let log = "";
-
-const freePort = () => new Promise((resolve, reject) => {
-  const probe = createServer();
-  probe.on("error", reject);
-  probe.listen(0, "127.0.0.1", () => {
-    const { port } = probe.address();
-    probe.close(() => resolve(port));
-  });
-});
 
 before(async () => {
   if (skip) return;
   data = await mkdtemp(join(tmpdir(), "multistage-service-"));
-  const port = await freePort();
-  url = `http://127.0.0.1:${port}/`;
-  service = spawn(BINARY, ["serve", "--bind", `127.0.0.1:${port}`, "--data-dir", data], { stdio: ["ignore", "pipe", "pipe"] });
-  for (const stream of [service.stdout, service.stderr]) stream.on("data", (text) => { log += text; });
-  let ended = false;
-  service.on("exit", () => { ended = true; });
-  service.on("error", (error) => { ended = true; log += error; });
-  for (const deadline = Date.now() + 30_000; ; ) {
-    if (await fetch(`${url}readyz`).then((answer) => answer.ok, () => false)) break;
-    assert.ok(!ended && Date.now() < deadline, `the service did not come up: ${log}`);
-    await new Promise((resolve) => setTimeout(resolve, 100));
-  }
+  service = await startService(data);
+  ({ url } = service);
   browser = await openBrowser();
 });
 after(async () => {
   await browser?.close();
-  if (service && service.exitCode === null) {
-    const gone = new Promise((resolve) => service.on("exit", resolve));
-    service.kill("SIGTERM");
-    await gone;
-  }
+  await service?.stop();
   if (data) await rm(data, { recursive: true, force: true });
 });
 
