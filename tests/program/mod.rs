@@ -22,11 +22,17 @@ impl Program {
 
     /// The same with further arguments.
     pub fn start_with(data_dir: &Path, arguments: &[&str]) -> Self {
+        Self::start_logging(data_dir, arguments, Stdio::inherit())
+    }
+
+    /// The same, with its log to there.
+    pub fn start_logging(data_dir: &Path, arguments: &[&str], log: impl Into<Stdio>) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_multistage"))
             .args(["serve", "--bind", "127.0.0.1:0", "--threads", "2", "--data-dir"])
             .arg(data_dir)
             .args(arguments)
             .env("RUST_LOG", "error")
+            .stderr(log)
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
@@ -35,6 +41,11 @@ impl Program {
         output.read_line(&mut line).unwrap();
         let base = line.trim().strip_prefix("listening on ").unwrap_or_else(|| panic!("{line:?}"));
         Self { base: base.trim_end_matches('/').to_owned(), output, child }
+    }
+
+    /// The process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
     }
 
     /// As `kill -9`: no time for anything.
