@@ -4,8 +4,8 @@ use axum::extract::rejection::QueryRejection;
 use axum::extract::{FromRequest, FromRequestParts, RawPathParams, Request};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, header};
-use serde::Deserialize;
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, Error};
+use serde::{Deserialize, Deserializer};
 use uuid::Uuid;
 
 use super::problem::{Code, Problem};
@@ -34,6 +34,18 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for Json<T> {
             .map_err(|_| Problem::new(Code::PayloadTooLarge).detail("the body is too long or broke off"))?;
         serde_json::from_slice(&body).map(Json).map_err(|error| Problem::new(Code::InvalidJson).detail(error))
     }
+}
+
+/// A whole number out of JSON, which may write it as `2.0`.
+pub(super) fn whole_number<'de, D: Deserializer<'de>>(deserializer: D) -> Result<i64, D::Error> {
+    let number = serde_json::Number::deserialize(deserializer)?;
+    let not_whole = || D::Error::custom(format!("{number} is no whole number"));
+    if let Some(whole) = number.as_i64() {
+        return Ok(whole);
+    }
+    // Every whole number that means something here is far smaller than where f64 has gaps.
+    let float = number.as_f64().filter(|float| float.fract() == 0.0 && float.abs() < 1e15).ok_or_else(not_whole)?;
+    Ok(float as i64)
 }
 
 /// Query parameters.

@@ -68,7 +68,7 @@ async fn priorities_and_turns_decide_who_is_next() {
 
     // ann's third goes to the end of her own by a lower priority.
     let link = |job: &Value| job["links"]["self"].as_str().unwrap().to_owned();
-    let moved = ann.send_json("PATCH", &link(&jobs[1]), &json!({"priority": -1})).await.ok(200);
+    let moved = ann.send_json("PATCH", &link(&jobs[1]), &json!({"priority": -1.0})).await.ok(200);
     assert_eq!((&moved["priority"], &moved["queue"]["position"]), (&json!(-1), &json!(5)));
     ann.send_json("PATCH", &link(&jobs[1]), &json!({"priority": 2})).await.assert_problem(403, "forbidden");
     ann.send_json("PATCH", &link(&jobs[1]), &json!({"priority": -11})).await.assert_problem(422, "invalid_priority");

@@ -12,7 +12,7 @@ use uuid::Uuid;
 
 use super::webhooks::WebhookBody;
 use crate::http::access::Principal;
-use crate::http::extract::{JobId, Json, Page, Query, cut, media_type};
+use crate::http::extract::{JobId, Json, Page, Query, cut, media_type, whole_number};
 use crate::http::problem::{Code, Problem};
 use crate::http::submission::{Order, submit};
 use crate::http::upload::{Form, Parts, Received};
@@ -89,6 +89,7 @@ async fn show(State(state): State<AppState>, JobId(id): JobId) -> Result<Respons
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct JobChange {
+    #[serde(deserialize_with = "whole_number")]
     priority: i64,
 }
 
@@ -125,7 +126,7 @@ struct NewJobBody {
     dataset_id: Uuid,
     #[serde(default)]
     name: String,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "whole_number")]
     priority: i64,
     options: Option<serde_json::Map<String, serde_json::Value>>,
     webhook: Option<WebhookBody>,
@@ -176,7 +177,8 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
 
 fn priority_of(received: &Received) -> Result<i64, Problem> {
     let text = received.text("priority").unwrap_or("0");
-    text.parse()
+    serde_json::from_str::<serde_json::Value>(text)
+        .and_then(whole_number)
         .map_err(|_| Problem::new(Code::InvalidPriority).detail(format!("priority {text:?} is no whole number")))
 }
 
