@@ -144,11 +144,6 @@ impl Problem {
         self
     }
 
-    /// Which it is.
-    pub fn code(&self) -> Code {
-        self.code
-    }
-
     /// Everything it says to people, in one line.
     pub(super) fn sentence(&self) -> String {
         let title = || self.code.status().canonical_reason().unwrap_or_default().to_owned();
