@@ -191,7 +191,7 @@ async fn when_all_places_are_taken_idle_connections_make_room() {
     }
     let since = Instant::now();
     let answer = reqwest::Client::new().get(format!("{}/healthz", service.base)).send().await.unwrap();
-    assert!(answer.status().is_success() && since.elapsed() < HEALTHY_P99, "{:?}", since.elapsed());
+    assert!(answer.status().is_success() && since.elapsed() < Attack::chosen().healthy_p99, "{:?}", since.elapsed());
     let mut closed = 0;
     for connection in &mut idle {
         let read = tokio::time::timeout(Duration::from_millis(20), connection.read(&mut [0; 8])).await;
