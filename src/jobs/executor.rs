@@ -68,8 +68,8 @@ pub struct Executor {
 /// What choosing needs to know.
 #[derive(Default)]
 struct Desk {
-    /// Memory of the running jobs.
-    running: HashMap<Uuid, u64>,
+    /// The running jobs: their datasets and their memory.
+    running: HashMap<Uuid, (Uuid, u64)>,
     /// Estimates of the waiting ones.
     needs: HashMap<Uuid, Needs>,
 }
@@ -178,6 +178,11 @@ impl Executor {
         desk.needs.retain(|job, _| waiting.contains(job));
         for id in waiting {
             let Some(row) = jobs::find(store.db.reader(), id).await? else { continue };
+            let dataset: Uuid = row.dataset_id.parse().map_err(|_| StoreError::NotFound)?;
+            // Two runs on the same photographs would do the same work twice at once; the second goes on from the first.
+            if desk.running.values().any(|(other, _)| *other == dataset) {
+                continue;
+            }
             let mut needs = match desk.needs.get(&id) {
                 Some(needs) => *needs,
                 None => self.estimate(id, &row).await?,
@@ -185,11 +190,16 @@ impl Executor {
             desk.needs.insert(id, needs);
             // A run that filled the disk needs more than was thought.
             needs.disk_bytes = needs.disk_bytes.max(row.needed_bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0));
-            let (data, taken) = (store.data.clone(), desk.running.values().sum());
-            let written =
-                spawn_blocking(move || DataDir::folder_bytes(&data.job(id))).await.map_err(io::Error::other)??;
-            let free = store.free_bytes().await?;
-            let (choice, given) = match fit(&needs, &self.machine, taken, free, written) {
+            let taken = desk.running.values().map(|(_, memory)| memory).sum();
+            let folders = vec![store.data.job(id), store.data.work(dataset)];
+            let look = folders.clone();
+            let written = spawn_blocking(move || look.iter().map(|folder| DataDir::folder_bytes(folder)).sum());
+            let written: u64 = written.await.map_err(io::Error::other).and_then(|sum: io::Result<u64>| sum)?;
+            let mut fits = fit(&needs, &self.machine, taken, store.free_bytes().await?, written);
+            if fits == Fit::Wait(Hold::DiskFull) && store.drop_idle_work().await? {
+                fits = fit(&needs, &self.machine, taken, store.free_bytes().await?, written);
+            }
+            let (choice, given) = match fits {
                 Fit::Wait(hold) => {
                     self.jobs.hold(id, hold).await?;
                     continue;
@@ -202,8 +212,8 @@ impl Executor {
                 }
             };
             let Some(row) = self.jobs.claim(id, &given).await? else { continue };
-            desk.running.insert(id, given.memory_bytes);
-            store.reserve_space(id, given.disk_bytes);
+            desk.running.insert(id, (dataset, given.memory_bytes));
+            store.reserve_space(id, folders, given.disk_bytes.saturating_sub(written));
             return Ok(Some((row, choice)));
         }
         Ok(None)
@@ -313,7 +323,8 @@ impl Executor {
     fn spawn(&self, id: Uuid, row: &JobRow, context: Context) -> Result<oneshot::Receiver<EngineResult>, StoreError> {
         let data = &self.jobs.store.data;
         let dataset = row.dataset_id.parse().map_err(|_| StoreError::NotFound)?;
-        let paths = RunPaths { images_dir: data.images(dataset), out_dir: data.partial(id), work_dir: data.work(id) };
+        let paths =
+            RunPaths { images_dir: data.images(dataset), out_dir: data.partial(id), work_dir: data.work(dataset) };
         std::fs::create_dir_all(&paths.work_dir)?;
         atomic::empty_dir(&paths.out_dir)?;
         let options = serde_json::from_str(&row.options).unwrap_or_default();
@@ -338,7 +349,6 @@ impl Executor {
             match self.try_finish(id, &outcome, &mut outputs).await {
                 Ok(state) => {
                     self.jobs.hub.announce();
-                    self.forget_work(id, state).await;
                     return state;
                 }
                 Err(error) => {
@@ -397,19 +407,6 @@ impl Executor {
         tx.commit().await?;
         self.jobs.figures.ended(state, code.as_deref());
         Ok(state)
-    }
-
-    /// Removes what a run would have gone on from, once it serves nobody.
-    async fn forget_work(&self, id: Uuid, state: JobState) {
-        if state != JobState::Succeeded {
-            return;
-        }
-        let (store, work) = (Arc::clone(&self.jobs.store), self.jobs.store.data.work(id));
-        match tokio::task::spawn_blocking(move || store.data.discard(&work)).await {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => tracing::warn!(job = %id, %error, "the work folder could not be removed"),
-            Err(error) => tracing::error!(job = %id, %error, "removing the work folder panicked"),
-        }
     }
 }
 

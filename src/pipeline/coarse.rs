@@ -1,6 +1,7 @@
 //! The stages `coarse_match` and `coarse_model`, widened when the largest scales alone do not connect enough images.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -11,7 +12,7 @@ use super::features::{FeatureCache, ImageFeatures};
 use super::intake::{Intake, Photograph};
 use super::options::{CoarseOptions, ReconstructionOptions};
 use super::run::key;
-use super::runner::{ArtifactKey, Counts, Runner, StageProgress, counts};
+use super::runner::{ArtifactKey, Counts, Runner, StageProgress, counts, io_error};
 use super::state::{ModelState, PipelineState};
 use super::{Context, PipelineError, Stage, StageKey, focals};
 use crate::add_cameras::MatchCounts;
@@ -24,6 +25,7 @@ use crate::coarse::{CoarseModels, MapperImage, MapperInput, MatchGraph};
 use crate::matching::two_view::{self, TwoViewGeometry};
 use crate::math::Rng;
 use crate::scene::{ApartImages, CameraId, Features, ImageId, KeypointIdx};
+use crate::store::ArtifactStore;
 
 /// Number of coarse matches of every pair that was matched, verified or not: what ranked matching goes by.
 pub type PairMatchCounts = MatchCounts;
@@ -84,8 +86,16 @@ pub fn run(
             0,
             |store, progress| {
                 let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
-                let matcher =
-                    Matcher { intake, found, options: &options.coarse, selection: &selection, cache: &cache, context };
+                let matcher = Matcher {
+                    store,
+                    key: &match_key,
+                    intake,
+                    found,
+                    options: &options.coarse,
+                    selection: &selection,
+                    cache: &cache,
+                    context,
+                };
                 let result = matcher.run(&before, &settled.unwrap_or_default(), progress)?;
                 cache.check(Stage::CoarseMatch)?;
                 Ok(result)
@@ -224,8 +234,16 @@ fn positions(cache: &FeatureCache<'_>, id: ImageId) -> Arc<[Pixel]> {
     features.keypoints.iter().map(|keypoint| Pixel::new(f64::from(keypoint.x), f64::from(keypoint.y))).collect()
 }
 
+/// Pairs of a unit of work: what a run that is stopped may have to do again, a few CPU seconds.
+const UNIT_PAIRS: usize = 256;
+
+/// Two photographs, the lower id first.
+type Pair = (ImageId, ImageId);
+
 /// One run of `coarse_match`.
 struct Matcher<'a> {
+    store: &'a ArtifactStore,
+    key: &'a ArtifactKey,
     intake: &'a Intake,
     found: &'a BTreeMap<ImageId, ImageFeatures>,
     options: &'a CoarseOptions,
@@ -233,6 +251,9 @@ struct Matcher<'a> {
     cache: &'a FeatureCache<'a>,
     context: &'a Context,
 }
+
+/// Number of matches of a pair, and what its verification found.
+type Matched = (Pair, (u32, Option<TwoViewGeometry>));
 
 /// The selected features of an image. Only those of a tile of pairs are in memory at a time.
 struct Selected {
@@ -250,15 +271,29 @@ impl Matcher<'_> {
         settled: &BTreeSet<ImageId>,
         progress: &StageProgress<'_>,
     ) -> Result<(CoarseMatches, Counts), PipelineError> {
-        let pairs: Vec<(ImageId, ImageId)> =
+        let pairs: Vec<Pair> =
             self.pairs().into_iter().filter(|(a, b)| !(settled.contains(a) && settled.contains(b))).collect();
         let done = AtomicU64::new(0);
-        let matched = self.for_pairs(&pairs, |(a, b), (in_a, in_b)| {
+        let more = |count: usize| {
+            let count = count as u64;
+            progress.set(done.fetch_add(count, Ordering::Relaxed) + count, pairs.len() as u64);
+        };
+        let mut reused = 0;
+        let known = |unit: &[Pair]| {
+            let stored: Option<Vec<Matched>> = self.stored_unit(unit)?;
+            if stored.is_some() {
+                reused += unit.len();
+                more(unit.len());
+            }
+            Ok(stored)
+        };
+        let work = |(a, b): Pair, (in_a, in_b): (&Selected, &Selected)| {
             let matches = match_hybrid(&in_a.descriptors, &in_b.descriptors, &self.options.matching).matches;
             let geometry = self.verify((a, b), (in_a, in_b), &matches, &self.intake.cameras);
-            progress.set(done.fetch_add(1, Ordering::Relaxed) + 1, pairs.len() as u64);
+            more(1);
             (matches.len() as u32, geometry)
-        });
+        };
+        let matched = self.for_pairs(&pairs, known, work, |unit, results| self.store_unit(unit, results))?;
         self.context.check_cancelled()?;
 
         let mut result = CoarseMatches {
@@ -282,12 +317,13 @@ impl Matcher<'_> {
         } else {
             before.cameras.clone()
         };
-        self.reverify(&mut result);
+        self.reverify(&mut result)?;
         self.context.check_cancelled()?;
         let inliers = result.graph.pairs.values().map(|geometry| geometry.inliers.len()).sum();
         let selected = self.usable().map(|(_, _, count)| self.selection.num_selected(count)).sum();
         let totals = counts([
             ("pairs_tried", pairs.len()),
+            ("pairs_reused", reused),
             ("pairs_matched", tentative),
             ("pairs_verified", verified),
             ("features_selected", selected),
@@ -308,7 +344,7 @@ impl Matcher<'_> {
     }
 
     /// The pairs to match, by the few features of largest scale that pair selection looks at.
-    fn pairs(&self) -> Vec<(ImageId, ImageId)> {
+    fn pairs(&self) -> Vec<Pair> {
         let options = &self.options.pairs;
         let usable: Vec<_> = self.usable().collect();
         let all_pairs = usable.len() <= options.exhaustive_up_to;
@@ -343,42 +379,72 @@ impl Matcher<'_> {
         Selected { pixels, descriptors: CoarseDescriptors::new(&features.descriptors), camera }
     }
 
-    /// Does `work` for every pair, in parallel, with the selected features of both images. Pairs are done in tiles of images
-    /// that share what was read, so that memory does not grow with the number of images. Once cancelled, what is left is
-    /// left out.
+    /// The key of a unit of work: everything that decides its result.
+    fn unit_key(&self, unit: &[Pair]) -> String {
+        ArtifactKey::of("coarse_unit", &[&self.key.0, &unit]).0
+    }
+
+    /// What an earlier run that was stopped found for a unit of work.
+    fn stored_unit(&self, unit: &[Pair]) -> Result<Option<Vec<Matched>>, PipelineError> {
+        let key = self.unit_key(unit);
+        let bytes = self.store.get(&key).map_err(|source| io_error(Stage::CoarseMatch, Path::new(&key), source))?;
+        Ok(bytes.and_then(|bytes| postcard::from_bytes(&bytes).ok()))
+    }
+
+    fn store_unit(&self, unit: &[Pair], results: &[Matched]) -> Result<(), PipelineError> {
+        let key = self.unit_key(unit);
+        let bytes = postcard::to_stdvec(results).expect("matches serialise");
+        self.store.put(&key, &bytes).map_err(|source| io_error(Stage::CoarseMatch, Path::new(&key), source))
+    }
+
+    /// Does `work` for every pair, in parallel, with the selected features of both images, unless the unit of work that the pair
+    /// belongs to is `known`; a unit that is done is `kept`. Pairs are done in tiles of images that share what was read, so that
+    /// memory does not grow with the number of images. Once cancelled, what is left is left out.
     fn for_pairs<T: Send>(
         &self,
-        pairs: &[(ImageId, ImageId)],
-        work: impl Fn((ImageId, ImageId), (&Selected, &Selected)) -> T + Sync,
-    ) -> Vec<((ImageId, ImageId), T)> {
+        pairs: &[Pair],
+        mut known: impl FnMut(&[Pair]) -> Result<Option<Vec<(Pair, T)>>, PipelineError>,
+        work: impl Fn(Pair, (&Selected, &Selected)) -> T + Sync,
+        keep: impl Fn(&[Pair], &[(Pair, T)]) -> Result<(), PipelineError>,
+    ) -> Result<Vec<(Pair, T)>, PipelineError> {
         let cameras = self.camera_of_image();
-        let mut tiles: BTreeMap<(u32, u32), Vec<(ImageId, ImageId)>> = BTreeMap::new();
+        let mut tiles: BTreeMap<(u32, u32), Vec<Pair>> = BTreeMap::new();
         for &(a, b) in pairs {
             tiles.entry((a.0 / TILE_IMAGES, b.0 / TILE_IMAGES)).or_default().push((a, b));
         }
         let mut images: BTreeMap<ImageId, Selected> = BTreeMap::new();
         let mut results = Vec::with_capacity(pairs.len());
-        for tile in tiles.into_values() {
+        for unit in tiles.values().flat_map(|tile| tile.chunks(UNIT_PAIRS)) {
             if self.context.cancel.is_cancelled() {
                 break;
             }
-            let needed: BTreeSet<ImageId> = tile.iter().flat_map(|&(a, b)| [a, b]).collect();
-            images.retain(|id, _| needed.contains(id));
+            if let Some(stored) = known(unit)? {
+                results.extend(stored);
+                continue;
+            }
+            let needed: BTreeSet<ImageId> = unit.iter().flat_map(|&(a, b)| [a, b]).collect();
+            // Units of one tile share images; whatever is of another goes.
+            let same_tile = |id: &ImageId| needed.iter().any(|other| other.0 / TILE_IMAGES == id.0 / TILE_IMAGES);
+            images.retain(|id, _| same_tile(id));
             let missing: Vec<ImageId> = needed.into_iter().filter(|id| !images.contains_key(id)).collect();
             let read = missing.into_par_iter().map(|id| (id, self.select(id, cameras[&id])));
             images.extend(read.collect::<Vec<_>>());
-            let of_tile = tile.into_par_iter().filter_map(|(a, b)| {
+            let of_unit = unit.par_iter().filter_map(|&(a, b)| {
                 let done = (!self.context.cancel.is_cancelled()).then(|| work((a, b), (&images[&a], &images[&b])));
                 Some(((a, b), done?))
             });
-            results.extend(of_tile.collect::<Vec<_>>());
+            let of_unit: Vec<_> = of_unit.collect();
+            if of_unit.len() == unit.len() {
+                keep(unit, &of_unit)?;
+            }
+            results.extend(of_unit);
         }
-        results
+        Ok(results)
     }
 
     fn verify(
         &self,
-        (a, b): (ImageId, ImageId),
+        (a, b): Pair,
         (in_a, in_b): (&Selected, &Selected),
         matches: &[(KeypointIdx, KeypointIdx)],
         cameras: &BTreeMap<CameraId, Camera>,
@@ -391,7 +457,7 @@ impl Matcher<'_> {
     /// Verifies those pairs again, as calibrated, whose focal lengths were not trusted the first time, so that they have
     /// relative poses. A focal length that is still a guess is taken for the moment: poses from it are rough but can start a
     /// model, which then refines it.
-    fn reverify(&self, result: &mut CoarseMatches) {
+    fn reverify(&self, result: &mut CoarseMatches) -> Result<(), PipelineError> {
         let camera_of = self.camera_of_image();
         let mut cameras = result.cameras.clone();
         for camera in cameras.values_mut() {
@@ -403,10 +469,10 @@ impl Matcher<'_> {
             before.focal_source >= FocalSource::Exif && before == &result.cameras[camera]
         };
         let graph = &mut result.graph;
-        let pending: Vec<(ImageId, ImageId)> =
-            graph.pairs.keys().filter(|(a, b)| !(trusted(a) && trusted(b))).copied().collect();
-        let verified =
-            self.for_pairs(&pending, |pair, images| self.verify(pair, images, &graph.pairs[&pair].inliers, &cameras));
+        let pending: Vec<Pair> = graph.pairs.keys().filter(|(a, b)| !(trusted(a) && trusted(b))).copied().collect();
+        let again =
+            |pair, images: (&Selected, &Selected)| self.verify(pair, images, &graph.pairs[&pair].inliers, &cameras);
+        let verified = self.for_pairs(&pending, |_| Ok(None), again, |_, _| Ok(()))?;
         for (pair, geometry) in verified {
             let Some(mut geometry) = geometry else { continue };
             let before = graph.pairs.remove(&pair).map(|before| before.inliers).unwrap_or_default();
@@ -416,5 +482,6 @@ impl Matcher<'_> {
             }
             graph.pairs.insert(pair, geometry);
         }
+        Ok(())
     }
 }

@@ -4,7 +4,7 @@
 //! lock                       held by the process that uses the directory
 //! multistage.db              SQLite (with -wal and -shm beside it)
 //! datasets/<id>/images/...   photographs under the names they came with
-//! jobs/<id>/work/...         artifacts of a run, to go on from
+//! datasets/<id>/work/...     artifacts of runs, to go on from, also with other options
 //! jobs/<id>/partial/...      outputs while a run writes them
 //! jobs/<id>/out/...          published outputs
 //! jobs/<id>/thumbnails/...   made on demand
@@ -86,9 +86,9 @@ impl DataDir {
         self.root.join("jobs").join(job.to_string())
     }
 
-    /// The artifacts of a job.
-    pub fn work(&self, job: Uuid) -> PathBuf {
-        self.job(job).join("work")
+    /// The artifacts of all runs on a dataset.
+    pub fn work(&self, dataset: Uuid) -> PathBuf {
+        self.dataset(dataset).join("work")
     }
 
     /// The outputs of a job while the run writes them.

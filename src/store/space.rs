@@ -24,11 +24,19 @@ const LOOK_AGAIN: Duration = Duration::from_secs(5);
 #[derive(Debug, Default)]
 pub struct Reservations(Mutex<HashMap<Uuid, Reservation>>);
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct Reservation {
+    /// Still to be written when it began.
     bytes: u64,
-    written: u64,
-    looked: Option<Instant>,
+    /// Where, and what lay there then and when it was last looked at.
+    folders: Vec<PathBuf>,
+    before: u64,
+    now: u64,
+    looked: Instant,
+}
+
+fn size_of(folders: &[PathBuf]) -> io::Result<u64> {
+    folders.iter().map(|folder| DataDir::folder_bytes(folder)).sum()
 }
 
 impl Reservations {
@@ -38,25 +46,45 @@ impl Reservations {
     }
 
     /// Bytes reserved and not written yet.
-    fn outstanding_bytes(&self, data: &DataDir) -> u64 {
+    fn outstanding_bytes(&self) -> u64 {
         let mut all = self.all();
-        for (job, reservation) in all.iter_mut() {
-            if reservation.looked.is_none_or(|at| at.elapsed() > LOOK_AGAIN) {
+        for reservation in all.values_mut() {
+            if reservation.looked.elapsed() > LOOK_AGAIN {
                 // A folder that changes while it is looked at counts as it was.
-                if let Ok(written) = DataDir::folder_bytes(&data.job(*job)) {
-                    reservation.written = written;
-                }
-                reservation.looked = Some(Instant::now());
+                reservation.now = size_of(&reservation.folders).unwrap_or(reservation.now);
+                reservation.looked = Instant::now();
             }
         }
-        all.values().map(|reservation| reservation.bytes.saturating_sub(reservation.written)).sum()
+        let left = |reservation: &Reservation| {
+            reservation.bytes.saturating_sub(reservation.now.saturating_sub(reservation.before))
+        };
+        all.values().map(left).sum()
     }
 }
 
 impl Store {
-    /// Keeps room for all that a job will have written in the end, until it is [released](Self::release_space).
-    pub fn reserve_space(&self, job: Uuid, bytes: u64) {
-        self.reservations.all().insert(job, Reservation { bytes, written: 0, looked: None });
+    /// Keeps room for what a job has still to write to its folders, until it is [released](Self::release_space).
+    pub fn reserve_space(&self, job: Uuid, folders: Vec<PathBuf>, bytes: u64) {
+        let before = size_of(&folders).unwrap_or(0);
+        let reservation = Reservation { bytes, folders, before, now: before, looked: Instant::now() };
+        self.reservations.all().insert(job, reservation);
+    }
+
+    /// Removes artifacts of datasets that no job waits for or runs on: they only save time; whether there were any.
+    ///
+    /// # Errors
+    /// What the system or SQLite said.
+    pub async fn drop_idle_work(&self) -> Result<bool, StoreError> {
+        let mut dropped = false;
+        for dataset in db::datasets::without_active_job(self.db.reader()).await? {
+            let Ok(dataset) = dataset.parse::<Uuid>() else { continue };
+            let (data, work) = (self.data.clone(), self.data.work(dataset));
+            if work.exists() {
+                tokio::task::spawn_blocking(move || data.discard(&work)).await.map_err(io::Error::other)??;
+                dropped = true;
+            }
+        }
+        Ok(dropped)
     }
 
     /// Forgets what a job reserved.
@@ -80,8 +108,7 @@ impl Store {
     /// What the system or SQLite said.
     pub async fn free_bytes(&self) -> Result<u64, StoreError> {
         let promised = db::uploads::outstanding_bytes(self.db.reader()).await?;
-        let taken =
-            [RESERVE_BYTES, u64::try_from(promised).unwrap_or(0), self.reservations.outstanding_bytes(&self.data)];
+        let taken = [RESERVE_BYTES, u64::try_from(promised).unwrap_or(0), self.reservations.outstanding_bytes()];
         Ok(taken.into_iter().fold(self.disk_free_bytes()?, u64::saturating_sub))
     }
 

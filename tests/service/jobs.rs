@@ -35,9 +35,28 @@ async fn a_folder_of_photographs_becomes_a_model() {
     let dataset = job["dataset_id"].as_str().unwrap();
     let stored = files_below(&service.data_dir().join("datasets").join(dataset).join("images"));
     assert_eq!(stored, ["a.jpg", "lone.png", "sub/b 石.JPG", "sub/bad.tif"]);
-    // What the run kept to go on from has served its purpose, and no upload leaves scraps.
-    assert!(!service.data_dir().join("jobs").join(job["id"].as_str().unwrap()).join("work").exists());
+    // No upload leaves scraps.
     assert_eq!(files_below(&service.data_dir().join("incoming")), [""; 0]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_with_other_options_goes_on_from_what_an_earlier_one_did() {
+    let service = Service::start().await;
+    let first = service.job("quick").await;
+    let first = service.wait_state(&first, "succeeded").await;
+    let body = json!({"dataset_id": first["dataset_id"], "options": {"mode": "no_model"}});
+    let second = service.post_json("/api/v1/jobs", &body).await.ok(202);
+    let second = service.wait_state(&second, "failed").await;
+    assert!(second["stages"].as_array().unwrap().iter().all(|stage| stage["state"] == "reused"), "{second:#}");
+    // It goes with the photographs.
+    for job in [&first, &second] {
+        service.delete(job["links"]["self"].as_str().unwrap()).await.ok(204);
+    }
+    let left = service.get("/api/v1/datasets").await.ok(200);
+    for dataset in left["datasets"].as_array().unwrap() {
+        service.delete(dataset["links"]["self"].as_str().unwrap()).await.ok(204);
+    }
+    assert_eq!(files_below(&service.data_dir().join("datasets")), [""; 0]);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -124,6 +124,15 @@ pub async fn unused_since(db: impl SqliteExecutor<'_>, before_ms: i64) -> sqlx::
     .await
 }
 
+/// Datasets on which no job waits or runs.
+pub async fn without_active_job(db: impl SqliteExecutor<'_>) -> sqlx::Result<Vec<String>> {
+    sqlx::query_scalar(
+        "SELECT id FROM datasets WHERE id NOT IN (SELECT dataset_id FROM jobs WHERE state IN ('queued', 'running'))",
+    )
+    .fetch_all(db)
+    .await
+}
+
 /// Datasets of uploads that were never acknowledged: made for a job that does not exist.
 pub async fn abandoned(db: impl SqliteExecutor<'_>) -> sqlx::Result<Vec<String>> {
     sqlx::query_scalar("SELECT id FROM datasets WHERE owner_job IS NOT NULL AND owner_job NOT IN (SELECT id FROM jobs)")
