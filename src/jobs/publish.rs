@@ -16,7 +16,9 @@ use crate::store::{Checksums, DataDir, StoreError, atomic};
 /// Makes the outputs that a run left in its partial folder durable and puts them in the place of older ones, all at once.
 /// Blocking.
 pub(super) fn publish(data: &DataDir, job: Uuid) -> io::Result<Vec<JobOutputRow>> {
-    let (partial, out) = (data.partial(job), data.out(job));
+    let out = data.out(job);
+    // An earlier attempt may have come as far as the rename.
+    let partial = if data.partial(job).exists() { data.partial(job) } else { out.clone() };
     let mut outputs = Vec::new();
     for path in atomic::list_files(&partial)? {
         let mut file = File::open(partial.join(&path))?;
@@ -30,8 +32,10 @@ pub(super) fn publish(data: &DataDir, job: Uuid) -> io::Result<Vec<JobOutputRow>
         });
     }
     atomic::sync_folders(&partial)?;
-    data.discard(&out)?;
-    std::fs::rename(&partial, &out)?;
+    if partial != out {
+        data.discard(&out)?;
+        std::fs::rename(&partial, &out)?;
+    }
     atomic::sync_parent(&out)?;
     Ok(outputs)
 }
