@@ -1,7 +1,8 @@
 //! Many clients at once on the real program: uploads beside listeners on events, and thousands of photographs through tus.
 //!
-//! An ordinary run is short. The figures of the README are by
-//! `MULTISTAGE_LOAD_S=60 MULTISTAGE_LOAD_FILES=10000 cargo test --release --locked --test load -- --nocapture --test-threads=1`.
+//! An ordinary run is short. Long ones, as for the README:
+//! `MULTISTAGE_LOAD_S=60 MULTISTAGE_LOAD_FILES=500 cargo test --locked --test load -- --nocapture --test-threads=1`; 10,000 photographs of 4 MiB
+//! need 40 GiB, `MULTISTAGE_LOAD_FILE_BYTES` makes them smaller.
 
 #![allow(clippy::unwrap_used)]
 
