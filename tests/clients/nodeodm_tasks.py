@@ -100,7 +100,8 @@ refused(lambda: task.restart({"iterations": "many"}), "iterations")
 assert task.cancel()
 assert task.info().status == TaskStatus.CANCELED
 refused(lambda: task.get(f"/task/{task.uuid}/download/all.zip"), "not completed")
-assert task.restart()
+# With other features nothing done before is of use, so that there is time to cancel.
+assert task.restart({"max-num-features": 9000} if busy else None)
 if busy:
     while task.info().status == TaskStatus.QUEUED:
         time.sleep(0.01)
