@@ -5,7 +5,7 @@
 //! whose candidates are gathered once ([`super::line_groups`], [`super::candidate_search`]).
 
 use super::candidate_search::{CandidateSearch, SeenMarks};
-use super::epipolar::{BoundingBox, EpipolarGeometry};
+use super::epipolar::{BoundingBox, EpipolarGeometry, EpipolarLine};
 use super::line_groups::group_by_line;
 use super::options::GuidedMatchOptions;
 use super::prepared::PreparedImage;
@@ -77,8 +77,9 @@ impl OneWay<'_> {
         let sweep = Sweep::new(&self.geometry.epipole_in_target(), bounds, positions, descriptors, members);
         let mut asked: Vec<_> = queries
             .filter_map(|(query, at)| {
-                let line = self.geometry.line_in_target(&at)?;
-                Some((sweep.pencil().line(&self.geometry.line_coefficients(&at)), line, query))
+                let coefficients = self.geometry.line_coefficients(&at);
+                let line = EpipolarLine::from_coefficients(&coefficients)?;
+                Some((sweep.pencil().line(&coefficients), line, query))
             })
             .collect();
         asked.sort_unstable_by_key(|(of_pencil, _, query)| (of_pencil.turn, *query));

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use super::Failure;
-use crate::store::{DataDir, Db, back_up};
+use super::data_dir::{block_on, existing_database};
+use crate::store::{Db, back_up};
 
 /// Arguments of `multistage backup`.
 #[derive(Debug, clap::Args)]
@@ -18,19 +19,12 @@ pub(super) struct Args {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .map_err(|error| Failure::Outside(format!("can't start the runtime: {error}")))?;
-    runtime.block_on(copy(args))
+    block_on(copy(args))
 }
 
 async fn copy(args: &Args) -> Result<(), Failure> {
     let outside = |error: &dyn std::fmt::Display| Failure::Outside(format!("{}: {error}", args.data_dir.display()));
-    let database = DataDir::database_in(&args.data_dir);
-    if !database.exists() {
-        return Err(Failure::Input(format!("{}: there is no data directory", args.data_dir.display())));
-    }
+    let database = existing_database(&args.data_dir)?;
     let db = Db::open(&database).await.map_err(|error| outside(&error))?;
     let account = back_up(&db, &args.data_dir, &args.to).await.map_err(|error| outside(&error))?;
     db.close().await;

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::Failure;
+use super::data_dir::{block_on, existing_database};
 use crate::jobs::{Stale, find_stale, remove_stale};
 use crate::store::{DataDir, Db, Store};
 
@@ -23,19 +24,12 @@ pub(super) struct Args {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .map_err(|error| Failure::Outside(format!("can't start the runtime: {error}")))?;
-    runtime.block_on(clean_up(args))
+    block_on(clean_up(args))
 }
 
 async fn clean_up(args: &Args) -> Result<(), Failure> {
     let outside = |error: &dyn std::fmt::Display| Failure::Outside(format!("{}: {error}", args.data_dir.display()));
-    let database = DataDir::database_in(&args.data_dir);
-    if !database.exists() {
-        return Err(Failure::Input(format!("{}: there is no data directory", args.data_dir.display())));
-    }
+    let database = existing_database(&args.data_dir)?;
     let keep = Duration::from_secs(24 * 3600 * u64::from(args.keep_days));
     let db = Db::open(&database).await.map_err(|error| outside(&error))?;
     let stale = find_stale(&db, keep).await.map_err(|error| outside(&error))?;

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::Failure;
+use super::data_dir::{block_on, existing_database};
 use crate::store::{DataDir, Db, Finding, examine};
 
 /// Arguments of `multistage doctor`.
@@ -21,19 +22,12 @@ pub(super) struct Args {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .map_err(|error| Failure::Outside(format!("can't start the runtime: {error}")))?;
-    runtime.block_on(look(args))
+    block_on(look(args))
 }
 
 async fn look(args: &Args) -> Result<(), Failure> {
     let outside = |error: &dyn std::fmt::Display| Failure::Outside(format!("{}: {error}", args.data_dir.display()));
-    let database = DataDir::database_in(&args.data_dir);
-    if !database.exists() {
-        return Err(Failure::Input(format!("{}: there is no data directory", args.data_dir.display())));
-    }
+    let database = existing_database(&args.data_dir)?;
     // Before looking: what a running service is about to store must not be taken for an orphan.
     let own =
         if args.quarantine { Some(DataDir::open(&args.data_dir).map_err(|error| outside(&error))?) } else { None };

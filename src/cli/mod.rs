@@ -5,6 +5,7 @@
 
 mod backup;
 mod cleanup;
+mod data_dir;
 mod demo;
 mod doctor;
 mod evaluate;

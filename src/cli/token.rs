@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Subcommand;
 
 use super::Failure;
+use super::data_dir::block_on;
 use crate::jobs::view::time_text;
 use crate::store::db::{now_ms, tokens};
 use crate::store::{DataDir, Db, Quota, Scope, create_token};
@@ -52,11 +53,7 @@ enum Action {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .map_err(|error| Failure::Outside(format!("can't start the runtime: {error}")))?;
-    runtime.block_on(act(args))
+    block_on(act(args))
 }
 
 async fn act(args: &Args) -> Result<(), Failure> {
