@@ -4,9 +4,9 @@
 //! Points(C_j)` the candidates of an image are those with `|P_cv| > T`, and of these the k most covisible. The pairs of all
 //! images' candidate sets, each once, are matched.
 //!
-//! Two floors come from the authors' own scripts: `k = max(10 %, 20)`, as a tenth of a small set is nothing; and an image
-//! with too few candidates is also paired with the candidates of its candidates, as in a sparse model two images may see
-//! one wall through different points.
+//! Two floors, an idea of the authors' own scripts: `k = max(10 %, 10)` (theirs: 20), as a tenth of a small set is nothing;
+//! and an image with too few candidates is also paired with the candidates of its candidates, as in a sparse model two images
+//! may see one wall through different points.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -12,7 +12,8 @@ use super::prepared::PreparedImage;
 use super::sweep::Sweep;
 use crate::camera::Normalized;
 use crate::matching::descriptor::{
-    BandQuery, BandTop2, BandedRows, PackedDescriptors, Top2, distance_sq, nearest_off_bands, top2, top2_in_bands,
+    BandQuery, BandTop2, BandedRows, PackedDescriptors, Top2, distance_sq, least_distance_sq, nearest_off_bands, top2,
+    top2_in_bands,
 };
 use crate::math::Rng;
 use crate::scene::Descriptor;
@@ -95,12 +96,12 @@ impl OneWay<'_> {
         let rivals = self.random_rivals(&sweep, &bands, &nearest, rng);
 
         let per_line = sweep.windows_per_line();
-        let mut found = Vec::new();
+        let (mut found, mut elsewhere) = (Vec::new(), Vec::new());
         for (at, (&(_, _, query), nearest)) in asked.iter().zip(&nearest).enumerate() {
             let Some((slot, best_sq)) = nearest.nearest else { continue };
             let Some(best) = sweep.feature(slot) else { continue };
             let second = least(nearest.second_distance_sq, rivals[at]);
-            let elsewhere = || {
+            let second_elsewhere = || {
                 // The second is a rival unless it is at the best one's place; only then are all candidates looked at again.
                 let here = target.same_place.others(best);
                 let to = |feature: u32| distance_sq(bands[at].descriptor, &descriptors[feature as usize]);
@@ -111,9 +112,11 @@ impl OneWay<'_> {
                 }
                 let others = sweep.features_in_band(&bands[at], &windows[at * per_line..(at + 1) * per_line]);
                 let others = others.filter(|feature| *feature != best && here.binary_search(feature).is_err());
-                least(others.map(to).min(), rivals[at])
+                elsewhere.clear();
+                elsewhere.extend(others);
+                least(least_distance_sq(bands[at].descriptor, descriptors, &elsewhere), rivals[at])
             };
-            self.judge(query, best, best_sq, second, elsewhere, &mut found);
+            self.judge(query, best, best_sq, second, second_elsewhere, &mut found);
         }
         found
     }

@@ -18,13 +18,14 @@ pub struct SelectionOptions {
     pub all_below: usize,
     /// At least this many features, however small the share. Ours.
     pub min_features: usize,
-    /// At most this many features, however large the share; null for no limit. Bounds the time of matching a pair. Ours.
+    /// At most this many features, however large the share; null for no limit. Bounds the time of matching a pair. Ours: at
+    /// 25,000 features an image it is the paper's 10 %, whose models are as good here as those of 20 % in 2/5 of the time.
     pub max_features: Option<usize>,
 }
 
 impl Default for SelectionOptions {
     fn default() -> Self {
-        Self { eta_percent: 20.0, all_below: 1000, min_features: 1500, max_features: Some(4096) }
+        Self { eta_percent: 20.0, all_below: 1000, min_features: 1500, max_features: Some(2560) }
     }
 }
 
@@ -73,7 +74,7 @@ mod tests {
     fn small_images_use_all_and_large_ones_a_fifth() {
         let options = SelectionOptions::default();
         let selected: Vec<usize> = [0, 999, 1400, 4000, 10_000, 30_000].map(|n| options.num_selected(n)).into();
-        assert_eq!(selected, [0, 999, 1400, 1500, 2000, 4096]);
+        assert_eq!(selected, [0, 999, 1400, 1500, 2000, 2560]);
         let paper = SelectionOptions { min_features: 0, max_features: None, ..options };
         assert_eq!([999, 1000, 30_000].map(|n| paper.num_selected(n)), [999, 200, 6000]);
     }
@@ -81,7 +82,7 @@ mod tests {
     #[test]
     fn widening_ends_with_everything() {
         let wider = SelectionOptions::default().widened().unwrap();
-        assert_eq!((wider.eta_percent, wider.max_features), (40.0, Some(8192)));
+        assert_eq!((wider.eta_percent, wider.max_features), (40.0, Some(5120)));
         let all = wider.widened().unwrap();
         assert_eq!(all.num_selected(100_000), 100_000);
         assert_eq!(all.widened(), None);

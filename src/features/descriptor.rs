@@ -11,7 +11,7 @@
 
 use std::f32::consts::{SQRT_2, TAU};
 
-use super::gradient::{LANES, Patch};
+use super::gradient::{Every, LANES, Patch};
 use super::orientation::clip;
 use super::ring::Ring;
 use super::simd::{Isa, mul_add, stamp, whole_number};
@@ -38,9 +38,9 @@ const CLIP: f32 = 0.2;
 /// Quantisation of the square roots.
 const QUANTISATION: f32 = 512.0;
 
-/// From this sigma on, in pixels of its level, every second row is looked at: what a Gaussian of this width leaves of an image
-/// turns so slowly that the rows between tell next to nothing, and a bin still holds two or three rows.
-const SPARSE_ROWS_FROM_SIGMA: f32 = 1.4;
+/// From this sigma on, in pixels of its level, every second row and column is looked at: what a Gaussian of this width leaves
+/// of an image turns so slowly that the pixels between tell next to nothing, and a bin is still two or three of those wide.
+const SPARSE_FROM_SIGMA: f32 = 1.4;
 
 /// How far a descriptor at a keypoint of this sigma reaches, in the same pixels.
 pub(super) fn radius_px(sigma: f32) -> f32 {
@@ -96,11 +96,13 @@ impl Describer {
         let (top, bottom) = clip(y, radius, height);
         let (from, to) = clip(x, radius, width);
         let falloff = -1.0 / (FALLOFF * bin * bin);
-        patch.set_window(x, falloff, from, to);
-        let every = if sigma >= SPARSE_ROWS_FROM_SIGMA { 2 } else { 1 };
-        // The keypoint's own row is one of them, wherever it lies.
-        let first = top + (y.round() as usize).abs_diff(top) % every;
-        for row in (first..bottom).step_by(every) {
+        let every = if sigma >= SPARSE_FROM_SIGMA { Every::Second } else { Every::Pixel };
+        let step = every.columns();
+        // The keypoint's own row and column are among them, wherever they lie.
+        let first = top + (y.round() as usize).abs_diff(top) % step;
+        let from = from + (x.round() as usize).abs_diff(from) % step;
+        patch.set_window(x, falloff, from, to, every);
+        for row in (first..bottom).step_by(step) {
             let dy = row as f32 - y;
             let (u, v) = (sin * dy / bin, cos * dy / bin);
             let (low_u, high_u) = inside(u, du);
@@ -110,14 +112,15 @@ impl Describer {
                 continue;
             }
             let (left, right) = clip(x + 0.5 * (low + high), 0.5 * (high - low), width);
-            let (left, right) = (left.max(from), right.min(to));
+            let left = from + left.saturating_sub(from).next_multiple_of(step);
+            let right = right.min(to);
             if left >= right {
                 continue;
             }
-            patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
-            let dx = left as f32 - x;
-            let stretch = Stretch { u: u + du * dx, v: v + dv * dx, du, dv, theta };
-            let count = right - left;
+            let count = patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
+            let (dx, per_column) = (left as f32 - x, step as f32);
+            let (u, v) = (u + du * dx, v + dv * dx);
+            let stretch = Stretch { u, v, du: per_column * du, dv: per_column * dv, theta };
             accumulate(isa, &stretch, &patch.weight[..count], &patch.direction[..count], &mut self.copies);
         }
         quantise(isa, &self.copies)

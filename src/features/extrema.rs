@@ -121,6 +121,18 @@ fn extremum_lanes(
     if alive.iter().fold(0, |any, &lane| any | lane) == 0 {
         return None;
     }
+    // Many blocks come this far; the same pixel of the levels above and below stops most of them before the costly test.
+    let finer: &[f32; LANES] = strict[1][x..x + LANES].try_into().ok()?;
+    let coarser: &[f32; LANES] = lax[2][x..x + LANES].try_into().ok()?;
+    for i in 0..LANES {
+        let v = value[i];
+        let high = (v > threshold) & (v > finer[i]) & (v >= coarser[i]);
+        let low = (v < -threshold) & (v < finer[i]) & (v <= coarser[i]);
+        alive[i] &= i32::from(high | low);
+    }
+    if alive.iter().fold(0, |any, &lane| any | lane) == 0 {
+        return None;
+    }
     let (mut before_max, mut before_min) = (*left, *left);
     let (mut after_max, mut after_min) = (*right, *right);
     for row in strict {

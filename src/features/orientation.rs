@@ -2,7 +2,7 @@
 
 use std::f32::consts::TAU;
 
-use super::gradient::{LANES, Patch};
+use super::gradient::{Every, LANES, Patch};
 use super::ring::Ring;
 use super::simd::{Isa, stamp, whole_number};
 
@@ -35,7 +35,7 @@ pub(super) fn find(
     let mut copies = [[0.0_f32; BINS + 1]; COPIES];
     let (top, bottom) = clip(y, radius, height);
     let (from, to) = clip(x, radius, width);
-    patch.set_window(x, falloff, from, to);
+    patch.set_window(x, falloff, from, to, Every::Pixel);
     for row in top..bottom {
         let dy = row as f32 - y;
         let half = (radius * radius - dy * dy).max(0.0).sqrt();
@@ -43,8 +43,8 @@ pub(super) fn find(
         if left >= right {
             continue;
         }
-        patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
-        add_to_histograms(isa, &patch.weight[..right - left], &patch.direction[..right - left], &mut copies);
+        let count = patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
+        add_to_histograms(isa, &patch.weight[..count], &patch.direction[..count], &mut copies);
     }
     let mut histogram = [0.0_f32; BINS + 1];
     for copy in &copies {

@@ -103,22 +103,20 @@ pub fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbIma
     let edge = |at: usize, new: usize, old: usize| at * old / new;
     let columns: Vec<usize> = (0..=new_width).map(|x| edge(x, new_width, width)).collect();
     let mut data = Vec::with_capacity(3 * new_width * new_height);
-    let mut sums = vec![[0_u32; 3]; new_width];
+    // Down the columns first: whole rows add up in vector registers, and only one row of sums a box is walked by pixels.
+    let mut of_columns = vec![0_u32; 3 * width];
     for y in 0..new_height {
-        sums.fill([0; 3]);
+        of_columns.fill(0);
         let rows = edge(y, new_height, height)..edge(y + 1, new_height, height);
-        for row in rows.clone() {
-            let row = image.data[3 * row * width..3 * (row + 1) * width].as_chunks::<3>().0;
-            for (sum, ends) in sums.iter_mut().zip(columns.windows(2)) {
-                for pixel in &row[ends[0]..ends[1]] {
-                    for (sum, &value) in sum.iter_mut().zip(pixel) {
-                        *sum += u32::from(value);
-                    }
-                }
+        for row in image.data[3 * width * rows.start..3 * width * rows.end].chunks_exact(3 * width) {
+            for (sum, &value) in of_columns.iter_mut().zip(row) {
+                *sum += u32::from(value);
             }
         }
-        for (sum, ends) in sums.iter().zip(columns.windows(2)) {
+        for ends in columns.windows(2) {
             let count = ((ends[1] - ends[0]) * rows.len()) as u32;
+            let of_box = of_columns.as_chunks::<3>().0[ends[0]..ends[1]].iter();
+            let sum = of_box.fold([0; 3], |sum: [u32; 3], column| std::array::from_fn(|k| sum[k] + column[k]));
             data.extend(sum.map(|sum| ((sum + count / 2) / count) as u8));
         }
     }

@@ -78,7 +78,17 @@ pub fn top2_both(
     Tier::detected().top2_both(queries, packed, of_queries, of_rows);
 }
 
+/// The squared distance from a query to the nearest of the rows `descriptors[indices[0]], ...`; none when there are none. For a
+/// few rows that are not worth packing, with the fastest instructions of this machine.
+///
+/// # Panics
+/// When an index is out of range.
+pub fn least_distance_sq(query: &Descriptor, descriptors: &[Descriptor], indices: &[u32]) -> Option<u32> {
+    Tier::detected().least_distance_sq(query, descriptors, indices)
+}
+
 /// The squared distance of two descriptors.
+#[inline(always)]
 pub fn distance_sq(a: &Descriptor, b: &Descriptor) -> u32 {
     a.iter().zip(b).map(|(&x, &y)| u32::from(x.abs_diff(y)).pow(2)).sum()
 }

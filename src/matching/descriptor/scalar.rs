@@ -1,8 +1,15 @@
 //! The plain kernel: the oracle of the others, and what runs where none of them can.
 
+use super::distance_sq;
 use super::kernel::Kernel;
 use super::packed::{GROUP_ROWS, Line, QUADS, QUERY_OFFSET};
 use crate::scene::Descriptor;
+
+/// [`super::least_distance_sq`] in ordinary arithmetic, which the compiler turns into what the caller was compiled for.
+#[inline(always)]
+pub(super) fn least_distance_sq(query: &Descriptor, descriptors: &[Descriptor], indices: &[u32]) -> Option<u32> {
+    indices.iter().map(|&index| distance_sq(query, &descriptors[index as usize])).min()
+}
 
 /// Sixteen integers and ordinary arithmetic.
 pub(super) struct Scalar;

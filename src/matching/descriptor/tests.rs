@@ -52,6 +52,21 @@ fn every_tier_agrees_with_the_definition() {
 }
 
 #[test]
+fn the_least_distance_is_the_definition_s_in_every_tier() {
+    let mut rng = Rng::from_parts(&[7]);
+    let rows = descriptors(&mut rng, 90);
+    for length in [0, 1, 2, 40] {
+        let indices: Vec<u32> = (0..length).map(|_| rng.below(rows.len()) as u32).collect();
+        for query in descriptors(&mut rng, 20) {
+            let expected = indices.iter().map(|&index| distance_sq(&query, &rows[index as usize])).min();
+            for &tier in Tier::ALL.iter().filter(|tier| tier.is_available()) {
+                assert_eq!(tier.least_distance_sq(&query, &rows, &indices), expected, "{tier:?}");
+            }
+        }
+    }
+}
+
+#[test]
 fn the_largest_distance_does_not_overflow() {
     let (black, white) = ([0; DESCRIPTOR_LEN], [255; DESCRIPTOR_LEN]);
     for (query, row) in [(black, white), (white, black)] {

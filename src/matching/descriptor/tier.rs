@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::sync::LazyLock;
 
 use super::banded::{self, BandQuery, BandTop2, BandedRows};
-use super::scalar::Scalar;
+use super::scalar::{self, Scalar};
 use super::{PackedDescriptors, Top2, kernel};
 use crate::scene::Descriptor;
 
@@ -117,6 +117,24 @@ impl Tier {
         }
     }
 
+    /// [`super::least_distance_sq`] with these instructions.
+    ///
+    /// # Panics
+    /// When the machine lacks them or an index is out of range.
+    pub fn least_distance_sq(self, query: &Descriptor, descriptors: &[Descriptor], indices: &[u32]) -> Option<u32> {
+        self.assert_available();
+        match self {
+            Self::Scalar => scalar::least_distance_sq(query, descriptors, indices),
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: all of these have the instructions of AVX2.
+            Self::Avx2 | Self::AvxVnni | Self::Avx512Vnni => unsafe {
+                x86::least_distance_sq_avx2(query, descriptors, indices)
+            },
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => scalar::least_distance_sq(query, descriptors, indices),
+        }
+    }
+
     /// [`super::top2_in_bands`] with these instructions.
     ///
     /// # Panics
@@ -185,7 +203,7 @@ mod x86 {
 
     use super::super::banded::{self, BandQuery, BandTop2, BandedRows};
     use super::super::x86::{Avx2, Avx512Vnni, AvxVnni};
-    use super::super::{PackedDescriptors, Top2, kernel};
+    use super::super::{PackedDescriptors, Top2, kernel, scalar};
     use crate::scene::Descriptor;
 
     macro_rules! compile {
@@ -233,6 +251,15 @@ mod x86 {
                 unsafe { banded::scan_off::<$kernel, $queries>(queries, ranks, rows, out) }
             }
         };
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn least_distance_sq_avx2(
+        query: &Descriptor,
+        descriptors: &[Descriptor],
+        indices: &[u32],
+    ) -> Option<u32> {
+        scalar::least_distance_sq(query, descriptors, indices)
     }
 
     compile_banded!("avx2", Avx2, 4, in_bands_avx2, off_bands_avx2);
