@@ -12,7 +12,7 @@ use super::pose::{Intrinsics, place};
 use super::ranked_match::{ranked_images, ranked_match};
 use super::{
     AddCamerasCancelled, AddCamerasOptions, Cancelled, Correspondence, LoadFeatures, LocalizationMethod,
-    LocalizeFailure, MatchCounts, ModelSnapshot, Progress,
+    LocalizeFailure, MatchCounts, ModelSnapshot, Outcome, Progress,
 };
 use crate::camera::Camera;
 use crate::coarse::cameras_to_share;
@@ -66,7 +66,7 @@ pub fn localize_image(
     match_counts: &MatchCounts,
     options: &AddCamerasOptions,
     seed: u64,
-) -> Result<Localized, LocalizeFailure> {
+) -> Outcome {
     if features.is_empty() {
         return Err(LocalizeFailure::NoFeatures);
     }
@@ -130,7 +130,7 @@ pub fn localize_all(
     seed: u64,
     progress: &Progress,
     cancelled: &Cancelled,
-) -> Result<BTreeMap<ImageId, Result<Localized, LocalizeFailure>>, AddCamerasCancelled> {
+) -> Result<BTreeMap<ImageId, Outcome>, AddCamerasCancelled> {
     let done = AtomicUsize::new(0);
     let outcomes: Vec<_> = queries
         .par_iter()

@@ -105,22 +105,38 @@ pub fn add_cameras(
         return Ok(AddCamerasReport::default());
     }
     let snapshot = ModelSnapshot::build(model, features, options);
-    let mut outcomes = BTreeMap::new();
-    let mut failed = BTreeMap::new();
     let found = localize_all(&snapshot, model, queries, features, match_counts, options, seed, progress, cancelled)?;
+    Ok(add_localized(model, &snapshot, found, features, options, seed))
+}
+
+/// What localising an image gave.
+pub type Outcome = Result<Localized, LocalizeFailure>;
+
+/// Adds to the model the images that could be localised against a snapshot of it.
+pub fn add_localized(
+    model: &mut Reconstruction,
+    snapshot: &ModelSnapshot,
+    found: BTreeMap<ImageId, Outcome>,
+    features: &LoadFeatures,
+    options: &AddCamerasOptions,
+    seed: u64,
+) -> AddCamerasReport {
+    let images_tried = found.len();
+    let mut localized = BTreeMap::new();
+    let mut failed = BTreeMap::new();
     for (id, outcome) in found {
         match outcome {
-            Ok(localized) => {
-                outcomes.insert(id, localized);
+            Ok(found) => {
+                localized.insert(id, found);
             }
             Err(failure) => {
                 failed.insert(id, failure);
             }
         }
     }
-    let applied = apply(model, &outcomes, features, &options.pose, seed);
+    let applied = apply(model, &localized, features, &options.pose, seed);
     failed.extend(applied.rejected);
-    let added = outcomes
+    let added = localized
         .iter()
         .filter(|(id, _)| model.image(**id).is_some())
         .map(|(&id, found)| {
@@ -128,12 +144,12 @@ pub fn add_cameras(
             (id, AddedImage { method: found.method, correspondences: found.num_correspondences, inliers })
         })
         .collect();
-    Ok(AddCamerasReport {
-        images_tried: queries.len(),
+    AddCamerasReport {
+        images_tried,
         added,
         failed,
         points_searched: snapshot.len(),
         words: snapshot.vocabulary.num_words(),
         observations_added: applied.observations_added,
-    })
+    }
 }

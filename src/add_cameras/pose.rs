@@ -11,7 +11,7 @@ use crate::scene::{Features, KeypointIdx, Reconstruction};
 
 /// Why an image could not be localised: how far the method came that came farthest.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
-#[serde(rename_all = "snake_case", tag = "reason")]
+#[serde(rename_all = "snake_case")]
 pub enum LocalizeFailure {
     /// The image has no features.
     #[error("the image has no features")]

@@ -12,11 +12,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use rayon::prelude::*;
 
+use serde::{Deserialize, Serialize};
+
 use super::options::CandidatePairOptions;
 use crate::scene::{ImageId, Reconstruction};
 
 /// Two images to match.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct CandidatePair {
     /// The image with the smaller id.
     pub first: ImageId,

@@ -14,6 +14,7 @@ use rayon::prelude::*;
 use super::options::TriangulationOptions;
 use super::triangulate::{StarTrack, refit};
 use super::views::{Sighting, ViewTable};
+use super::{AddPointsError, Cancelled};
 use crate::math::UnionFind;
 use crate::scene::{ImageId, Observation, Point3dId, Reconstruction};
 
@@ -31,16 +32,25 @@ pub struct TrackUpdate {
 }
 
 /// Merges tracks with one another and with the model's points. The order of the result is fixed.
+///
+/// # Errors
+/// When cancelled; asked for every component.
 pub fn merge_tracks(
     model: &Reconstruction,
     table: &ViewTable,
     stars: &[StarTrack],
     options: &TriangulationOptions,
-) -> Vec<TrackUpdate> {
+    cancelled: &Cancelled,
+) -> Result<Vec<TrackUpdate>, AddPointsError> {
     let components = connected_components(model, table, stars);
-    let resolved: Vec<Vec<TrackUpdate>> =
-        components.par_iter().map(|component| Resolver::new(model, table, stars, component, options).run()).collect();
-    resolved.into_iter().flatten().collect()
+    let resolve = |component: &Component| {
+        if cancelled() {
+            return Err(AddPointsError::Cancelled);
+        }
+        Ok(Resolver::new(model, table, stars, component, options).run())
+    };
+    let resolved: Vec<Vec<TrackUpdate>> = components.par_iter().map(resolve).collect::<Result<_, _>>()?;
+    Ok(resolved.into_iter().flatten().collect())
 }
 
 /// Tracks and points that hang together by shared sightings.

@@ -12,7 +12,7 @@
 //! - [`merge`] (6.3): the pieces of one point made one;
 //! - [`strays`]: points that rest on one match and lie where nothing else is, taken out at the end.
 //!
-//! A pair is a unit of work ([`match_pair`]): a pure function of the model, both images' features, options and seed. Poses
+//! A pair is a unit of work ([`PairMatcher`]): a pure function of the model, both images' features, options and seed. Poses
 //! are not changed; every pair and every image is independent of the others, and results are put together in id order, so
 //! the number of threads does not show.
 
@@ -25,6 +25,7 @@ pub mod line_groups;
 pub mod merge;
 pub mod one_way;
 mod options;
+pub mod pair_matcher;
 pub mod pencil;
 pub mod prepared;
 pub mod strays;
@@ -36,11 +37,10 @@ mod tests;
 pub mod triangulate;
 pub mod views;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use candidate_pairs::{CandidatePair, candidate_pairs};
@@ -49,11 +49,12 @@ pub use guided_match::{KeypointMatch, guided_match};
 pub use options::{
     AddPointsOptions, BlockOptions, CandidatePairOptions, GuidedMatchOptions, PixelScaling, TriangulationOptions,
 };
+pub use pair_matcher::{PairMatcher, match_pair, tiles};
 pub use prepared::PreparedImage;
 pub use strays::{StrayOptions, remove_strays};
 pub use triangulate::PairMatches;
 
-use crate::scene::{Features, ImageId, KeypointIdx, Reconstruction};
+use crate::scene::{Features, ImageId, Reconstruction};
 
 /// Why the stage ended without a result.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -127,80 +128,29 @@ pub fn add_points(
     cancelled: &Cancelled,
 ) -> Result<AddPointsReport, AddPointsError> {
     let pairs = candidate_pairs(model, new_images, &options.candidate_pairs);
-    let matches = match_pairs(model, &pairs, features, options, seed, progress, cancelled)?;
-    if cancelled() {
-        return Err(AddPointsError::Cancelled);
-    }
-    Ok(add_matches(model, &matches, options))
-}
-
-/// The matches of one pair: the unit of work of this stage.
-///
-/// # Errors
-/// When an image is not registered or the features are not those of the model's keypoints.
-pub fn match_pair(
-    model: &Reconstruction,
-    (first, second): (ImageId, ImageId),
-    (first_features, second_features): (Arc<Features>, Arc<Features>),
-    options: &AddPointsOptions,
-    seed: u64,
-) -> Result<PairMatches, AddPointsError> {
-    let a = prepare(model, first, first_features, options)?;
-    let b = prepare(model, second, second_features, options)?;
-    Ok(match_prepared(model, (first, &a), (second, &b), options, seed))
-}
-
-/// The matches of many pairs, in their order. Images are prepared once per tile of pairs ([`BlockOptions`]), and pairs are
-/// matched in parallel.
-///
-/// # Errors
-/// When cancelled, when an image is not registered or features are not those of the model's keypoints.
-pub fn match_pairs(
-    model: &Reconstruction,
-    pairs: &[CandidatePair],
-    features: &LoadFeatures,
-    options: &AddPointsOptions,
-    seed: u64,
-    progress: &Progress,
-    cancelled: &Cancelled,
-) -> Result<Vec<PairMatches>, AddPointsError> {
     let done = AtomicUsize::new(0);
-    let mut matches: Vec<PairMatches> = Vec::with_capacity(pairs.len());
-    let mut prepared: BTreeMap<ImageId, PreparedImage> = BTreeMap::new();
-    for tile in tiles(model, pairs, options.blocks.images_per_block) {
-        let needed: BTreeSet<ImageId> = tile.iter().flat_map(|pair| [pair.first, pair.second]).collect();
-        prepared.retain(|id, _| needed.contains(id));
-        let missing: Vec<ImageId> = needed.into_iter().filter(|id| !prepared.contains_key(id)).collect();
-        let fresh: Vec<(ImageId, PreparedImage)> = missing
-            .into_par_iter()
-            .map(|id| {
-                if cancelled() {
-                    return Err(AddPointsError::Cancelled);
-                }
-                Ok((id, prepare(model, id, features(id), options)?))
-            })
-            .collect::<Result<_, _>>()?;
-        prepared.extend(fresh);
-        let of_tile: Vec<PairMatches> = tile
-            .par_iter()
-            .map(|pair| {
-                if cancelled() {
-                    return Err(AddPointsError::Cancelled);
-                }
-                let (a, b) = ((pair.first, &prepared[&pair.first]), (pair.second, &prepared[&pair.second]));
-                let found = match_prepared(model, a, b, options, seed);
-                progress(done.fetch_add(1, Ordering::Relaxed) + 1, pairs.len());
-                Ok(found)
-            })
-            .collect::<Result<_, _>>()?;
-        matches.extend(of_tile);
+    let one_more = || progress(done.fetch_add(1, Ordering::Relaxed) + 1, pairs.len());
+    let mut matcher = PairMatcher::new(model, features, options, seed);
+    let mut matches = Vec::with_capacity(pairs.len());
+    for tile in tiles(model, &pairs, &options.blocks) {
+        matcher.prepare(&tile, cancelled)?;
+        matches.extend(matcher.match_pairs(&tile, &one_more, cancelled)?);
     }
-    matches.sort_by_key(|pair| (pair.first, pair.second));
-    Ok(matches)
+    add_matches(model, matches, options, cancelled)
 }
 
-/// Brings matches into the model: tracks per image, triangulation, merging (6.3).
-pub fn add_matches(model: &mut Reconstruction, matches: &[PairMatches], options: &AddPointsOptions) -> AddPointsReport {
+/// Brings the matches of all pairs into the model: tracks per image, triangulation, merging (6.3). The order of the pairs does
+/// not show.
+///
+/// # Errors
+/// When cancelled; the model is then unchanged.
+pub fn add_matches(
+    model: &mut Reconstruction,
+    mut matches: Vec<PairMatches>,
+    options: &AddPointsOptions,
+    cancelled: &Cancelled,
+) -> Result<AddPointsReport, AddPointsError> {
+    matches.sort_by_key(|pair| (pair.first, pair.second));
     let mut report = AddPointsReport {
         pairs_tried: matches.len(),
         pairs_matched: matches.iter().filter(|pair| !pair.matches.is_empty()).count(),
@@ -212,8 +162,8 @@ pub fn add_matches(model: &mut Reconstruction, matches: &[PairMatches], options:
     };
     let updates = {
         let table = views::ViewTable::new(model, &options.triangulation, &options.pixel_scaling);
-        let stars = triangulate::star_tracks(model, &table, matches);
-        merge::merge_tracks(model, &table, &stars, &options.triangulation)
+        let stars = triangulate::star_tracks(model, &table, &matches, cancelled)?;
+        merge::merge_tracks(model, &table, &stars, &options.triangulation, cancelled)?
     };
     let counts = merge::apply_updates(model, &updates);
     report.points_created = counts.created;
@@ -222,54 +172,5 @@ pub fn add_matches(model: &mut Reconstruction, matches: &[PairMatches], options:
     report.points_after = model.num_points();
     report.points_3plus_after = model.num_points_3plus();
     report.observations_after = model.num_observations();
-    report
-}
-
-/// An image of the model, prepared for matching.
-fn prepare(
-    model: &Reconstruction,
-    id: ImageId,
-    features: Arc<Features>,
-    options: &AddPointsOptions,
-) -> Result<PreparedImage, AddPointsError> {
-    let image = model.image(id).ok_or(AddPointsError::NotRegistered(id))?;
-    let (features_len, keypoints) = (features.len(), image.keypoints.len());
-    if features_len != keypoints || features.descriptors.len() != keypoints {
-        return Err(AddPointsError::FeaturesDoNotFit { image: id, features: features_len, keypoints });
-    }
-    Ok(PreparedImage::new(image, model.camera_of(id), features, &options.guided_match, &options.pixel_scaling))
-}
-
-fn match_prepared(
-    model: &Reconstruction,
-    first: (ImageId, &PreparedImage),
-    second: (ImageId, &PreparedImage),
-    options: &AddPointsOptions,
-    seed: u64,
-) -> PairMatches {
-    let settled = shared_observations(model, first.0, second.0);
-    let matches = guided_match(first, second, &settled, &options.guided_match, seed);
-    PairMatches { first: first.0, second: second.0, matches }
-}
-
-/// Keypoints of two registered images that see one point.
-fn shared_observations(model: &Reconstruction, first: ImageId, second: ImageId) -> Vec<(KeypointIdx, KeypointIdx)> {
-    let seen = (0u32..).map(KeypointIdx).zip(model.images()[&first].points());
-    seen.filter_map(|(keypoint, &point)| {
-        let track = &model.point(point?)?.track;
-        let at = track.binary_search_by_key(&second, |observation| observation.image).ok()?;
-        Some((keypoint, track[at].keypoint))
-    })
-    .collect()
-}
-
-/// The pairs in tiles of `side` by `side` images, each tile in one piece.
-fn tiles(model: &Reconstruction, pairs: &[CandidatePair], side: usize) -> Vec<Vec<CandidatePair>> {
-    let rank_of: BTreeMap<ImageId, usize> = model.images().keys().enumerate().map(|(rank, &id)| (id, rank)).collect();
-    let tile = |id: &ImageId| rank_of.get(id).map(|rank| rank / side);
-    let mut tiles: BTreeMap<_, Vec<CandidatePair>> = BTreeMap::new();
-    for pair in pairs {
-        tiles.entry((tile(&pair.first), tile(&pair.second))).or_default().push(*pair);
-    }
-    tiles.into_values().collect()
+    Ok(report)
 }

@@ -6,10 +6,11 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nalgebra::Vector3;
 
+use super::pair_matcher::shared_observations;
 use super::test_scene::{SceneSpec, TestScene, build};
 use super::*;
 use crate::matching::descriptor::distance_sq;
-use crate::scene::Observation;
+use crate::scene::{KeypointIdx, Observation};
 
 fn match_images(
     scene: &TestScene,
@@ -366,7 +367,7 @@ fn merged(scene: &TestScene, model: &Reconstruction, stars: &[Vec<(usize, usize)
             }
         })
         .collect();
-    merge::merge_tracks(model, &table, &stars, &options.triangulation)
+    merge::merge_tracks(model, &table, &stars, &options.triangulation, &|| false).unwrap()
 }
 
 #[test]
@@ -384,7 +385,7 @@ fn two_views_alone_need_a_distinctive_match() {
                 matches: vec![KeypointMatch { first: keypoint(pair[0]), second: keypoint(pair[1]), distinctive }],
             })
             .collect();
-        add_matches(&mut scene.posed.clone(), &pairs, &options).points_created
+        add_matches(&mut scene.posed.clone(), pairs, &options, &|| false).unwrap().points_created
     };
     assert_eq!([created(&[0, 4], true), created(&[0, 4], false), created(&[0, 2, 4], false)], [1, 0, 1]);
 }

@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::guided_match::KeypointMatch;
 use super::views::{Sighting, ViewTable};
+use super::{AddPointsError, Cancelled};
 use crate::geometry::triangulation::refine_point;
 use crate::scene::{ImageId, KeypointIdx, Reconstruction};
 
@@ -41,7 +42,15 @@ pub struct StarTrack {
 }
 
 /// The tracks of all images' keypoints, by image and keypoint.
-pub fn star_tracks(model: &Reconstruction, table: &ViewTable, matches: &[PairMatches]) -> Vec<StarTrack> {
+///
+/// # Errors
+/// When cancelled; asked for every image.
+pub fn star_tracks(
+    model: &Reconstruction,
+    table: &ViewTable,
+    matches: &[PairMatches],
+    cancelled: &Cancelled,
+) -> Result<Vec<StarTrack>, AddPointsError> {
     // The pairs of each image, as (index of the pair, whether it is the pair's first).
     let mut pairs_of: Vec<Vec<(usize, bool)>> = vec![Vec::new(); table.len()];
     for (index, pair) in matches.iter().enumerate() {
@@ -50,9 +59,14 @@ pub fn star_tracks(model: &Reconstruction, table: &ViewTable, matches: &[PairMat
             pairs_of[second as usize].push((index, false));
         }
     }
-    let of_image = |rank: usize| stars_of_image(model, table, matches, rank as u32, &pairs_of[rank]);
-    let stars: Vec<Vec<StarTrack>> = (0..table.len()).into_par_iter().map(of_image).collect();
-    stars.into_iter().flatten().collect()
+    let of_image = |rank: usize| {
+        if cancelled() {
+            return Err(AddPointsError::Cancelled);
+        }
+        Ok(stars_of_image(model, table, matches, rank as u32, &pairs_of[rank]))
+    };
+    let stars: Vec<Vec<StarTrack>> = (0..table.len()).into_par_iter().map(of_image).collect::<Result<_, _>>()?;
+    Ok(stars.into_iter().flatten().collect())
 }
 
 fn stars_of_image(

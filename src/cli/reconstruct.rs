@@ -11,8 +11,8 @@ use crate::pipeline::{CancelFlag, Context, PipelineError, ReconstructionOptions,
 /// Arguments of `reconstruct`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Exit status: 0 a model was made; 1 something outside failed; 2 bad arguments or input; 3 the \
-photographs gave no model (OUT_DIR/report.html says why); 130 interrupted (the same command goes on from the last finished \
-stage).")]
+photographs gave no model (OUT_DIR/report.html says why); 130 interrupted (the same command goes on from its last finished unit \
+of work).")]
 pub struct Args {
     /// Folder of photographs (JPEG, PNG, TIFF, WebP), with sub-folders.
     images_dir: PathBuf,

@@ -1,7 +1,6 @@
 //! The stages `coarse_match` and `coarse_model`, widened when the largest scales alone do not connect enough images.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -12,8 +11,9 @@ use super::features::{FeatureCache, ImageFeatures};
 use super::intake::{Intake, Photograph};
 use super::options::{CoarseOptions, ReconstructionOptions};
 use super::run::key;
-use super::runner::{ArtifactKey, Counts, Runner, StageProgress, counts, io_error};
+use super::runner::{ArtifactKey, Counts, Runner, StageProgress, counts};
 use super::state::{ModelState, PipelineState};
+use super::units::Units;
 use super::{Context, PipelineError, Stage, StageKey, focals};
 use crate::add_cameras::MatchCounts;
 use crate::camera::{Camera, FocalSource, Pixel};
@@ -25,7 +25,6 @@ use crate::coarse::{CoarseModels, MapperImage, MapperInput, MatchGraph};
 use crate::matching::two_view::{self, TwoViewGeometry};
 use crate::math::Rng;
 use crate::scene::{ApartImages, CameraId, Features, ImageId, KeypointIdx};
-use crate::store::ArtifactStore;
 
 /// Number of coarse matches of every pair that was matched, verified or not: what ranked matching goes by.
 pub type PairMatchCounts = MatchCounts;
@@ -87,8 +86,7 @@ pub fn run(
             |store, progress| {
                 let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
                 let matcher = Matcher {
-                    store,
-                    key: &match_key,
+                    units: Units::new(store, Stage::CoarseMatch, &match_key),
                     intake,
                     found,
                     options: &options.coarse,
@@ -242,8 +240,7 @@ type Pair = (ImageId, ImageId);
 
 /// One run of `coarse_match`.
 struct Matcher<'a> {
-    store: &'a ArtifactStore,
-    key: &'a ArtifactKey,
+    units: Units<'a>,
     intake: &'a Intake,
     found: &'a BTreeMap<ImageId, ImageFeatures>,
     options: &'a CoarseOptions,
@@ -280,7 +277,7 @@ impl Matcher<'_> {
         };
         let mut reused = 0;
         let known = |unit: &[Pair]| {
-            let stored: Option<Vec<Matched>> = self.stored_unit(unit)?;
+            let stored: Option<Vec<Matched>> = self.units.known(&unit)?;
             if stored.is_some() {
                 reused += unit.len();
                 more(unit.len());
@@ -293,7 +290,7 @@ impl Matcher<'_> {
             more(1);
             (matches.len() as u32, geometry)
         };
-        let matched = self.for_pairs(&pairs, known, work, |unit, results| self.store_unit(unit, results))?;
+        let matched = self.for_pairs(&pairs, known, work, |unit, results| self.units.keep(&unit, results))?;
         self.context.check_cancelled()?;
 
         let mut result = CoarseMatches {
@@ -377,24 +374,6 @@ impl Matcher<'_> {
         let features = self.cache.read(id, Some(self.selection.num_selected(count)));
         let pixels = features.keypoints.iter().map(|at| Pixel::new(f64::from(at.x), f64::from(at.y))).collect();
         Selected { pixels, descriptors: CoarseDescriptors::new(&features.descriptors), camera }
-    }
-
-    /// The key of a unit of work: everything that decides its result.
-    fn unit_key(&self, unit: &[Pair]) -> String {
-        ArtifactKey::of("coarse_unit", &[&self.key.0, &unit]).0
-    }
-
-    /// What an earlier run that was stopped found for a unit of work.
-    fn stored_unit(&self, unit: &[Pair]) -> Result<Option<Vec<Matched>>, PipelineError> {
-        let key = self.unit_key(unit);
-        let bytes = self.store.get(&key).map_err(|source| io_error(Stage::CoarseMatch, Path::new(&key), source))?;
-        Ok(bytes.and_then(|bytes| postcard::from_bytes(&bytes).ok()))
-    }
-
-    fn store_unit(&self, unit: &[Pair], results: &[Matched]) -> Result<(), PipelineError> {
-        let key = self.unit_key(unit);
-        let bytes = postcard::to_stdvec(results).expect("matches serialise");
-        self.store.put(&key, &bytes).map_err(|source| io_error(Stage::CoarseMatch, Path::new(&key), source))
     }
 
     /// Does `work` for every pair, in parallel, with the selected features of both images, unless the unit of work that the pair

@@ -2,6 +2,9 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
 
 use super::coarse::PairMatchCounts;
 use super::features::{FeatureCache, ImageFeatures};
@@ -9,11 +12,15 @@ use super::intake::Intake;
 use super::options::ReconstructionOptions;
 use super::runner::{Counts, StageProgress, counts};
 use super::state::PipelineState;
+use super::units::Units;
 use super::{Context, PipelineError, Stage};
-use crate::add_cameras::{LocalizeFailure, QueryImage, add_cameras};
+use crate::add_cameras::{LocalizeFailure, ModelSnapshot, Outcome, QueryImage, add_localized, localize_all};
 use crate::camera::Camera;
 use crate::coarse::Unregistered;
-use crate::scene::{CameraId, Features, ImageId};
+use crate::scene::{CameraId, Features, ImageId, Reconstruction};
+
+/// Images of a unit of work: a stop costs what a few images take, and storing a unit little next to that.
+const UNIT_IMAGES: usize = 8;
 
 /// What localisation is given besides the models.
 pub struct Localiser<'a> {
@@ -27,6 +34,8 @@ pub struct Localiser<'a> {
     pub match_counts: &'a PairMatchCounts,
     /// The features.
     pub cache: &'a FeatureCache<'a>,
+    /// Where finished units are kept.
+    pub units: &'a Units<'a>,
     /// All options.
     pub options: &'a ReconstructionOptions,
     /// Seed and cancel.
@@ -43,18 +52,21 @@ impl Localiser<'_> {
         mut state: PipelineState,
         progress: &StageProgress<'_>,
     ) -> Result<(PipelineState, Counts), PipelineError> {
-        let (mut tried, mut added, mut sightings) = (0, 0, 0);
+        let (mut tried, mut added, mut sightings, mut reused) = (0, 0, 0, 0);
         for rank in 0..state.models.len() {
             let queries = self.queries(&state);
             tried = tried.max(queries.len());
+            if queries.is_empty() {
+                continue;
+            }
             let load = |id: ImageId| -> Arc<Features> { self.cache.get(id) };
-            let told = |done: usize, total: usize| progress.set(done as u64, total as u64);
-            let cancelled = || self.context.cancel.is_cancelled();
             let model = &mut state.models[rank].model;
             let (options, seed) = (&self.options.add_cameras, self.context.seed);
-            let outcome = add_cameras(model, &queries, &load, self.match_counts, options, seed, &told, &cancelled);
+            let snapshot = ModelSnapshot::build(model, &load, options);
+            let (found, known) = self.localize(rank, model, &snapshot, &queries, progress)?;
+            reused += known;
+            let account = add_localized(model, &snapshot, found, &load, options, seed);
             self.cache.check(Stage::AddCameras)?;
-            let account = outcome.map_err(|_| PipelineError::Cancelled)?;
             added += account.added.len();
             sightings += account.observations_added;
             for id in account.added.keys() {
@@ -69,7 +81,54 @@ impl Localiser<'_> {
                 }
             }
         }
-        Ok((state, counts([("images_tried", tried), ("images_added", added), ("observations_added", sightings)])))
+        let totals = [
+            ("images_tried", tried),
+            ("images_reused", reused),
+            ("images_added", added),
+            ("observations_added", sightings),
+        ];
+        Ok((state, counts(totals)))
+    }
+
+    /// What localising each of `queries` against the model of this rank gives, and for how many an earlier run had found that.
+    fn localize(
+        &self,
+        rank: usize,
+        model: &Reconstruction,
+        snapshot: &ModelSnapshot,
+        queries: &[QueryImage],
+        progress: &StageProgress<'_>,
+    ) -> Result<(BTreeMap<ImageId, Outcome>, usize), PipelineError> {
+        let done = AtomicUsize::new(0);
+        let more = |count: usize| {
+            progress.set((done.fetch_add(count, Ordering::Relaxed) + count) as u64, queries.len() as u64);
+        };
+        let cancelled = || self.context.cancel.is_cancelled();
+        let load = |id: ImageId| -> Arc<Features> { self.cache.get(id) };
+        let (options, seed) = (&self.options.add_cameras, self.context.seed);
+        let (mut found, mut waiting) = (BTreeMap::new(), Vec::new());
+        for unit in queries.chunks(UNIT_IMAGES) {
+            match self.units.known::<BTreeMap<ImageId, Outcome>>(&(rank, unit))? {
+                Some(known) => {
+                    more(known.len());
+                    found.extend(known);
+                }
+                None => waiting.push(unit),
+            }
+        }
+        let reused = found.len();
+        let localized = waiting.into_par_iter().map(|unit| {
+            let told = |_, _| more(1);
+            let outcomes =
+                localize_all(snapshot, model, unit, &load, self.match_counts, options, seed, &told, &cancelled);
+            let outcomes = outcomes.map_err(|_| PipelineError::Cancelled)?;
+            self.cache.check(Stage::AddCameras)?;
+            self.units.keep(&(rank, unit), &outcomes)?;
+            Ok(outcomes)
+        });
+        let localized: Vec<BTreeMap<ImageId, Outcome>> = localized.collect::<Result<_, PipelineError>>()?;
+        found.extend(localized.into_iter().flatten());
+        Ok((found, reused))
     }
 
     /// The photographs that have features and no pose.

@@ -1,5 +1,6 @@
 //! The runner: order of the stages, units of work, options, progress, resume and the report.
 
+mod add_points;
 mod coarse;
 mod colors;
 mod context;
@@ -20,6 +21,7 @@ mod run;
 mod runner;
 mod stage;
 mod state;
+mod units;
 mod verdict;
 
 pub use context::{CancelFlag, Context, NoProgress, ProgressEvent, ProgressSink};

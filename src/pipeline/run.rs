@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
-use std::sync::Arc;
 
+use super::add_points::PointAdder;
 use super::features::{self, FeatureCache, ImageFeatures};
 use super::intake::{self, Intake};
 use super::localise::Localiser;
@@ -11,12 +11,12 @@ use super::measure::Stopwatch;
 use super::options::ReconstructionOptions;
 use super::runner::{ArtifactKey, Counts, Runner, counts};
 use super::state::{ModelState, PipelineState};
+use super::units::Units;
 use super::{Context, PipelineError, ProgressEvent, Stage, StageKey, coarse, export, refine, report};
-use crate::add_points;
 use crate::coarse::Unregistered;
 use crate::coarse::look_alikes::CutPair;
 use crate::formats::report::Report;
-use crate::scene::{Features, ImageId, world_frame};
+use crate::scene::{ImageId, world_frame};
 
 /// The folders of a run.
 #[derive(Clone, Debug)]
@@ -94,12 +94,14 @@ impl Pipeline<'_> {
             let before = state;
             state = runner.stage(stage, Some(&models_key), waiting, |store, progress| {
                 let cache = FeatureCache::new(store, &found, FEATURE_CACHE_BYTES);
+                let units = Units::new(store, Stage::AddCameras, &models_key);
                 let localiser = Localiser {
                     intake: &intake,
                     found: &found,
                     cameras: &cameras,
                     match_counts: &match_counts,
                     cache: &cache,
+                    units: &units,
                     options,
                     context,
                 };
@@ -116,9 +118,18 @@ impl Pipeline<'_> {
             let before = state;
             state = runner.stage(stage, Some(&models_key), 0, |store, progress| {
                 let cache = FeatureCache::new(store, &found, FEATURE_CACHE_BYTES);
+                let units = Units::new(store, Stage::AddPoints, &models_key);
+                let adder = PointAdder { cache: &cache, units: &units, options: &options.add_points, context };
                 let mut state = before;
-                let totals = self.add_points(&mut state, &cache, newly.as_ref(), progress)?;
-                cache.check(Stage::AddPoints)?;
+                let mut totals = Counts::new();
+                for (rank, ModelState { model, .. }) in state.models.iter_mut().enumerate() {
+                    let here = |id: &ImageId| model.image(*id).is_some();
+                    let newly: Option<BTreeSet<ImageId>> =
+                        newly.as_ref().map(|newly| newly.iter().copied().filter(here).collect());
+                    for (name, count) in adder.run(rank, model, newly.as_ref(), progress)? {
+                        *totals.entry(name).or_insert(0.0) += count;
+                    }
+                }
                 state.record(stage);
                 Ok((state, totals))
             })?;
@@ -159,50 +170,6 @@ impl Pipeline<'_> {
         }
         plan.push(key(Stage::Export));
         plan
-    }
-
-    /// Guided matching and triangulation in every model; `newly` are the images added since the last round.
-    fn add_points(
-        &self,
-        state: &mut PipelineState,
-        cache: &FeatureCache<'_>,
-        newly: Option<&BTreeSet<ImageId>>,
-        progress: &super::runner::StageProgress<'_>,
-    ) -> Result<Counts, PipelineError> {
-        let features = |id: ImageId| -> Arc<Features> { cache.get(id) };
-        let mut totals = Counts::new();
-        for ModelState { model, .. } in &mut state.models {
-            let new_here = newly.map(|newly| newly.iter().filter(|id| model.image(**id).is_some()).copied().collect());
-            let told = |done: usize, total: usize| progress.set(done as u64, total as u64);
-            let cancelled = || self.context.cancel.is_cancelled();
-            let options = &self.options.add_points;
-            let outcome = add_points::add_points(
-                model,
-                &features,
-                new_here.as_ref(),
-                options,
-                self.context.seed,
-                &told,
-                &cancelled,
-            );
-            self.context.check_cancelled()?;
-            cache.check(Stage::AddPoints)?;
-            let account = outcome.expect("neither cancelled nor with lost features");
-            let here = counts([
-                ("pairs_tried", account.pairs_tried),
-                ("pairs_matched", account.pairs_matched),
-                ("matches", account.matches),
-                ("points_before", account.points_before),
-                ("points", account.points_after),
-                ("points_3plus_before", account.points_3plus_before),
-                ("points_3plus", account.points_3plus_after),
-                ("observations", account.observations_after),
-            ]);
-            for (name, count) in here {
-                *totals.entry(name).or_insert(0.0) += count;
-            }
-        }
-        Ok(totals)
     }
 
     /// Levels the models, writes every output and the report.

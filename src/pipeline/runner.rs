@@ -1,8 +1,8 @@
 //! Runs stages: re-uses the result of an earlier run with the same inputs, measures, tells progress, keeps the account.
 //!
 //! A stage's result is stored under the hash of everything that decides it: the key of the stage before, the options it
-//! reads, the seed. So a run that was stopped at any moment goes on from its last finished stage, and one with other options
-//! re-does only what they touch.
+//! reads, the seed. So a run that was stopped at any moment goes on from its last finished stage (and within it from its finished
+//! [units of work](super::units)), and one with other options re-does only what they touch.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -12,6 +12,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::measure::Stopwatch;
+use super::units::Units;
 use super::{Context, PipelineError, ProgressEvent, Stage, StageKey};
 use crate::formats::report::StageReport;
 use crate::store::ArtifactStore;
@@ -150,6 +151,10 @@ impl<'a> Runner<'a> {
                 outcome
             }
         };
+        if let Some(key) = key {
+            // Also of a stage whose result a run stored just before it was stopped.
+            Units::new(&self.store, stage.stage, key).clear()?;
+        }
         let (wall_s, cpu_s) = (watch.wall_s(), watch.cpu_s());
         self.context.progress.report(ProgressEvent::StageFinished {
             stage,

@@ -88,6 +88,17 @@ impl ArtifactStore {
         atomic::write_atomic(&path, &self.scratch, &[&header, value])
     }
 
+    /// Removes every value whose key starts with `folder` and a `/`; there need be none.
+    ///
+    /// # Errors
+    /// What the system said, or an invalid key.
+    pub fn remove_folder(&self, folder: &str) -> io::Result<()> {
+        match std::fs::remove_dir_all(self.path(folder)?) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+            outcome => outcome,
+        }
+    }
+
     /// The file of a key. Keys are one or more parts joined by `/`, each of letters, digits, `_`, `-` and `.`, not starting
     /// with a dot; `scratch` is taken.
     fn path(&self, key: &str) -> io::Result<PathBuf> {
