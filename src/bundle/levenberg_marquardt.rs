@@ -9,6 +9,7 @@ use rayon::prelude::*;
 #[cfg(test)]
 mod tests;
 
+use super::KeepGoing;
 use super::back_substitution::{StepSums, step_points};
 use super::elimination::PartialSums;
 use super::options::{BundleOptions, StopReason};
@@ -77,8 +78,8 @@ impl<'a> Minimizer<'a> {
         Some(Self { problem, options, pattern, solver, parts, step, damping_diagonal })
     }
 
-    /// Minimises from `state`, which becomes the best state found.
-    pub fn run(&mut self, state: &mut State) -> Outcome {
+    /// Minimises from `state`, which becomes the best state found, as long as `keep_going` allows.
+    pub fn run(&mut self, state: &mut State, keep_going: &KeepGoing) -> Outcome {
         let mut trial = state.clone();
         let mut damping = Damping { lambda: self.options.initial_damping, growth: 2.0 };
         let mut outcome =
@@ -94,12 +95,21 @@ impl<'a> Minimizer<'a> {
                 }
             }
             outcome.final_cost = cost;
+            if !keep_going() {
+                outcome.stop = StopReason::Interrupted;
+                break;
+            }
             if self.gradient_vanished() {
                 outcome.stop = StopReason::GradientConverged;
                 break;
             }
             outcome.iterations += 1;
-            let sums = self.solve_reduced(damping.lambda).then(|| self.advance(state, &mut trial, damping.lambda));
+            let is_solved = self.solve_reduced(damping.lambda);
+            if !keep_going() {
+                outcome.stop = StopReason::Interrupted;
+                break;
+            }
+            let sums = is_solved.then(|| self.advance(state, &mut trial, damping.lambda));
             let ratio = sums.map(|sums| (cost - sums.cost) / (0.5 * (sums.descent + sums.damped_sq)));
             match (sums, ratio) {
                 (Some(sums), Some(ratio)) if ratio > MIN_RATIO && sums.cost < cost => {

@@ -34,8 +34,22 @@ use crate::scene::Reconstruction;
 use levenberg_marquardt::Minimizer;
 use problem::Problem;
 
+/// Asked whether to go on. Once it says no it must go on saying so.
+pub type KeepGoing<'a> = dyn Fn() -> bool + Sync + 'a;
+
 /// Adjusts what `config` lets change in `model`; the rest stays as it is, to the last bit.
 pub fn adjust(model: &mut Reconstruction, config: &BundleConfig, options: &BundleOptions) -> BundleReport {
+    adjust_while(model, config, options, &|| true)
+}
+
+/// [`adjust`] that ends early once `keep_going` says no, with the best state found until then. It is asked twice a step: the wait
+/// is at most a pass over the sightings, or one solution of the reduced system.
+pub fn adjust_while(
+    model: &mut Reconstruction,
+    config: &BundleConfig,
+    options: &BundleOptions,
+    keep_going: &KeepGoing,
+) -> BundleReport {
     let (problem, mut state) = Problem::build(model, config, options);
     let num_variable_points = problem.point_is_variable.iter().filter(|variable| **variable).count();
     let mut report = BundleReport {
@@ -55,7 +69,7 @@ pub fn adjust(model: &mut Reconstruction, config: &BundleConfig, options: &Bundl
         report.stop = StopReason::NoDescent;
         return report;
     };
-    let outcome = minimizer.run(&mut state);
+    let outcome = minimizer.run(&mut state, keep_going);
     problem.write_back(&state, model);
     BundleReport {
         stop: outcome.stop,

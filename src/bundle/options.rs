@@ -95,6 +95,8 @@ pub enum StopReason {
     NoDescent,
     /// There was nothing to change, or no sighting to go by.
     NothingToAdjust,
+    /// Somebody asked to stop.
+    Interrupted,
 }
 
 /// What [`super::adjust`] did.
@@ -121,6 +123,6 @@ pub struct BundleReport {
 impl BundleReport {
     /// Whether it ended by itself.
     pub fn converged(&self) -> bool {
-        !matches!(self.stop, StopReason::MaxIterations | StopReason::NothingToAdjust)
+        !matches!(self.stop, StopReason::MaxIterations | StopReason::NothingToAdjust | StopReason::Interrupted)
     }
 }

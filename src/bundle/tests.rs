@@ -1,5 +1,9 @@
 //! Adjustment of scenes with known truth.
 
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
 use super::*;
 use crate::camera::CameraModel;
 use crate::geometry::Rigid3;
@@ -225,6 +229,51 @@ fn the_number_of_threads_changes_no_bit() {
         (bytes(&model), report)
     };
     assert_eq!(run(1), run(4));
+}
+
+/// A model whose adjustment takes many steps, each long enough to be felt.
+fn large() -> Reconstruction {
+    let scene = SceneOptions {
+        layout: Layout::Orbit,
+        num_images: 120,
+        num_points: 40_000,
+        pixel_noise_px: 0.5,
+        detection_ratio: 0.5,
+        distractor_ratio: 0.0,
+        ..Default::default()
+    };
+    perturbed(&generate(&scene).truth, 0.5, 0.01, 0.02, false, 11)
+}
+
+#[test]
+fn an_adjustment_that_is_told_to_stop_stops_within_a_step() {
+    let start = large();
+    let tight = tight();
+    let whole = Instant::now();
+    let steps = adjust(&mut start.clone(), &everything(&start), &BundleOptions { max_iterations: 4, ..tight.clone() });
+    let step = whole.elapsed() / steps.iterations as u32;
+    assert_eq!((steps.stop, steps.iterations), (StopReason::MaxIterations, 4), "the problem takes more steps");
+    // Asked twice a step: in the middle of the second, and before the third.
+    for (asked_before, accepted) in [(3, 1), (4, 2)] {
+        let (mut model, asked) = (start.clone(), AtomicUsize::new(0));
+        let stopped: OnceLock<Instant> = OnceLock::new();
+        let keep_going = || {
+            let goes_on = asked.fetch_add(1, Ordering::Relaxed) < asked_before;
+            if !goes_on {
+                stopped.get_or_init(Instant::now);
+            }
+            goes_on
+        };
+        let report = adjust_while(&mut model, &everything(&start), &tight, &keep_going);
+        let took = stopped.get().expect("it was asked").elapsed();
+        assert!(took < 2 * step + Duration::from_millis(200), "{took:?} for steps of {step:?}");
+        assert_eq!((report.stop, report.accepted), (StopReason::Interrupted, accepted), "{report:?}");
+        assert!(report.final_cost < report.initial_cost && !report.converged());
+        // What it leaves is what as many whole steps leave.
+        let mut same = start.clone();
+        adjust(&mut same, &everything(&start), &BundleOptions { max_iterations: accepted, ..tight.clone() });
+        assert_eq!(bytes(&model), bytes(&same));
+    }
 }
 
 #[test]

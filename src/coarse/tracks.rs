@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 
 use super::MatchGraph;
+use crate::bundle::KeepGoing;
 use crate::math::UnionFind;
 use crate::scene::{ApartImages, ImageId, KeypointIdx, Observation};
 
@@ -20,12 +21,13 @@ pub struct Tracks {
 }
 
 impl Tracks {
-    /// Builds the tracks of a graph, none of which joins images that are apart.
-    pub fn build(graph: &MatchGraph, apart: &ApartImages) -> Self {
+    /// Builds the tracks of a graph, none of which joins images that are apart. Once `keep_going`, which is asked for every pair,
+    /// says no, further pairs are left out.
+    pub fn build(graph: &MatchGraph, apart: &ApartImages, keep_going: &KeepGoing) -> Self {
         let mut builder = TrackBuilder::new(graph, apart);
         let mut order: Vec<_> = graph.pairs.iter().collect();
         order.sort_by_key(|(_, geometry)| std::cmp::Reverse(geometry.inliers.len()));
-        for (&(a, b), geometry) in order {
+        for (&(a, b), geometry) in order.into_iter().take_while(|_| keep_going()) {
             for &(in_a, in_b) in &geometry.inliers {
                 builder.join(Observation { image: a, keypoint: in_a }, Observation { image: b, keypoint: in_b });
             }
@@ -63,15 +65,26 @@ pub(super) struct TrackBuilder<'a> {
 impl<'a> TrackBuilder<'a> {
     /// Every matched keypoint of the graph as a track of its own.
     pub(super) fn new(graph: &MatchGraph, apart: &'a ApartImages) -> Self {
-        let mut nodes: Vec<Observation> = Vec::new();
+        let mut is_matched: BTreeMap<ImageId, Vec<bool>> = BTreeMap::new();
         for (&(a, b), geometry) in &graph.pairs {
-            for &(in_a, in_b) in &geometry.inliers {
-                nodes.push(Observation { image: a, keypoint: in_a });
-                nodes.push(Observation { image: b, keypoint: in_b });
-            }
+            let mut note = |image: ImageId, keypoints: &mut dyn Iterator<Item = KeypointIdx>| {
+                let of_image = is_matched.entry(image).or_default();
+                for keypoint in keypoints {
+                    of_image.resize(of_image.len().max(keypoint.index() + 1), false);
+                    of_image[keypoint.index()] = true;
+                }
+            };
+            note(a, &mut geometry.inliers.iter().map(|inlier| inlier.0));
+            note(b, &mut geometry.inliers.iter().map(|inlier| inlier.1));
         }
-        nodes.sort_unstable();
-        nodes.dedup();
+        // By image, then keypoint.
+        let nodes: Vec<Observation> = is_matched
+            .into_iter()
+            .flat_map(|(image, of_image)| {
+                let matched = (0u32..).map(KeypointIdx).zip(of_image).filter(|&(_, is_matched)| is_matched);
+                matched.map(move |(keypoint, _)| Observation { image, keypoint })
+            })
+            .collect();
         Self {
             apart,
             sets: UnionFind::new(nodes.len()),

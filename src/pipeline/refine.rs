@@ -10,7 +10,7 @@ use crate::scene::{Point3dId, Reconstruction};
 /// Refines a model in place.
 ///
 /// # Errors
-/// Cancellation, asked for before every round.
+/// Cancellation, asked for at every step of an adjustment.
 pub fn refine(
     model: &mut Reconstruction,
     options: &ReconstructionOptions,
@@ -21,7 +21,8 @@ pub fn refine(
         merge_agreeing_cameras(model, &options.coarse.mapper.intrinsics);
         let mut config = BundleConfig::global(model, FreeIntrinsics::default());
         config.intrinsics = free_intrinsics(model, &options.coarse.mapper.intrinsics);
-        bundle::adjust(model, &config, &options.refine.bundle);
+        bundle::adjust_while(model, &config, &options.refine.bundle, &|| !context.cancel.is_cancelled());
+        context.check_cancelled()?;
         let all: Vec<Point3dId> = model.points().map(|(id, _)| id).collect();
         let min_triangulation_angle_rad = options.refine.min_triangulation_angle_deg.to_radians();
         let limits = KeepLimits { min_triangulation_angle_rad, ..options.coarse.mapper.keep_limits() };

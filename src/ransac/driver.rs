@@ -35,6 +35,10 @@ pub trait Estimator<const SAMPLE_SIZE: usize> {
     fn refine(&self, model: &Self::Model, inliers: &[usize], threshold_sq: f64) -> Option<Self::Model>;
 }
 
+/// The most trials that options may ask for. A loop is never left in the middle, so this bounds what a cancelled run still does: some
+/// seconds.
+const MOST_TRIALS: usize = 100_000;
+
 /// When to stop.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -44,7 +48,7 @@ pub struct RansacOptions {
     pub confidence: f64,
     /// Trials made in any case.
     pub min_trials: usize,
-    /// Trials never exceeded: what a hopeless problem costs.
+    /// Trials never exceeded, at most 100000: what a hopeless problem costs.
     pub max_trials: usize,
     /// Inlier ratio below which the model is not wanted: trials that only a lower ratio would need are not made.
     pub min_inlier_ratio: f64,
@@ -67,6 +71,9 @@ impl RansacOptions {
         }
         if self.max_trials == 0 || self.min_trials > self.max_trials {
             errors.push(format!("min_trials {} exceeds max_trials {}", self.min_trials, self.max_trials));
+        }
+        if self.max_trials > MOST_TRIALS {
+            errors.push(format!("max_trials must be at most {MOST_TRIALS}, not {}", self.max_trials));
         }
         if !(0.0..=1.0).contains(&self.min_inlier_ratio) {
             errors.push(format!("min_inlier_ratio must lie in [0, 1], not {}", self.min_inlier_ratio));

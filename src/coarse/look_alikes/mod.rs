@@ -31,6 +31,7 @@ use serde::{Deserialize, Serialize};
 
 use super::MatchGraph;
 use super::mapper::{self, CoarseModels, MapperInput, MapperOptions};
+use crate::bundle::KeepGoing;
 use crate::scene::{ApartImages, ImageId};
 use judgement::Verdict;
 use skeleton::Suspect;
@@ -77,7 +78,7 @@ pub fn reconstruct(
     options: &LookAlikeOptions,
     mapper_options: &MapperOptions,
     seed: u64,
-    keep_going: &(dyn Fn() -> bool + Sync),
+    keep_going: &KeepGoing,
     progress: &(dyn Fn(usize) + Sync),
 ) -> (CoarseModels, LookAlikeAccount) {
     let without = |left_out: &BTreeSet<(ImageId, ImageId)>, apart: ApartImages| {
@@ -85,7 +86,7 @@ pub fn reconstruct(
         let graph = MatchGraph { pairs: kept.map(|(&pair, geometry)| (pair, geometry.clone())).collect() };
         MapperInput { images: input.images.clone(), cameras: input.cameras.clone(), graph, apart }
     };
-    let suspects = if options.enabled { skeleton::suspects(input, options) } else { Vec::new() };
+    let suspects = if options.enabled { skeleton::suspects(input, options, keep_going) } else { Vec::new() };
     let put_off: BTreeSet<_> = suspects.iter().map(|suspect| suspect.images).collect();
     let confident = without(&put_off, ApartImages::default());
     let models = mapper::reconstruct(&confident, mapper_options, seed, keep_going, progress);

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use super::LookAlikeOptions;
 use super::strength::strengths;
+use crate::bundle::KeepGoing;
 use crate::coarse::MapperInput;
 use crate::coarse::tracks::{Relation, TrackBuilder};
 use crate::scene::{ImageId, Observation};
@@ -23,9 +24,10 @@ pub(super) struct Suspect {
 
 /// Takes pairs from the strongest to the weakest (ties by matches, then images) and puts off those that a stronger chain and
 /// its tracks contradict. Wide baselines lose features on the way and so agree only in part; a set is taken for free of
-/// look-alikes, and nothing is put off, unless some pair agrees nearly not at all.
-pub(super) fn suspects(input: &MapperInput, options: &LookAlikeOptions) -> Vec<Suspect> {
-    let strengths = strengths(input, options);
+/// look-alikes, and nothing is put off, unless some pair agrees nearly not at all. `keep_going` is asked for every pair; once it
+/// says no, nothing is found.
+pub(super) fn suspects(input: &MapperInput, options: &LookAlikeOptions, keep_going: &KeepGoing) -> Vec<Suspect> {
+    let Some(strengths) = strengths(input, options, keep_going) else { return Vec::new() };
     let mut order: Vec<_> = input.graph.pairs.iter().map(|(&images, geometry)| (images, geometry)).collect();
     order.sort_by(|(pair, geometry), (other_pair, other)| {
         let by_strength = strengths[other_pair].total_cmp(&strengths[pair]);
@@ -35,6 +37,9 @@ pub(super) fn suspects(input: &MapperInput, options: &LookAlikeOptions) -> Vec<S
     let mut forest = SpanningForest::default();
     let mut suspects = Vec::new();
     for ((a, b), geometry) in order {
+        if !keep_going() {
+            return Vec::new();
+        }
         let strength = strengths[&(a, b)];
         let chain_strength = forest.join_or_weakest_link(a, b, strength);
         let is_strong = chain_strength.is_none_or(|chain| strength >= options.joining_share * chain);

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::LookAlikeOptions;
+use crate::bundle::KeepGoing;
 use crate::coarse::MapperInput;
 use crate::scene::{ImageId, KeypointIdx};
 
@@ -14,7 +15,13 @@ type Cell = (u32, u32);
 /// each image those without a match of its own over.
 ///
 /// Cells instead of features: a densely textured copy must not outweigh sparse surroundings.
-pub(super) fn strengths(input: &MapperInput, options: &LookAlikeOptions) -> BTreeMap<(ImageId, ImageId), f64> {
+///
+/// None once `keep_going`, which is asked for every pair, says no.
+pub(super) fn strengths(
+    input: &MapperInput,
+    options: &LookAlikeOptions,
+    keep_going: &KeepGoing,
+) -> Option<BTreeMap<(ImageId, ImageId), f64>> {
     let mut known: BTreeMap<ImageId, BTreeSet<Cell>> = BTreeMap::new();
     let cell = |image: ImageId, keypoint: KeypointIdx| -> Cell {
         let image = &input.images[&image];
@@ -25,13 +32,16 @@ pub(super) fn strengths(input: &MapperInput, options: &LookAlikeOptions) -> BTre
     };
     let mut matched: BTreeMap<(ImageId, ImageId), [BTreeSet<Cell>; 2]> = BTreeMap::new();
     for (&(a, b), geometry) in &input.graph.pairs {
+        if !keep_going() {
+            return None;
+        }
         let cells_a: BTreeSet<Cell> = geometry.inliers.iter().map(|&(in_a, _)| cell(a, in_a)).collect();
         let cells_b: BTreeSet<Cell> = geometry.inliers.iter().map(|&(_, in_b)| cell(b, in_b)).collect();
         known.entry(a).or_default().extend(&cells_a);
         known.entry(b).or_default().extend(&cells_b);
         matched.insert((a, b), [cells_a, cells_b]);
     }
-    matched
+    let strengths = matched
         .into_iter()
         .map(|((a, b), [cells_a, cells_b])| {
             let share = |cells: &BTreeSet<Cell>, image: ImageId| cells.len() as f64 / known[&image].len() as f64;
@@ -39,5 +49,6 @@ pub(super) fn strengths(input: &MapperInput, options: &LookAlikeOptions) -> BTre
             let union = 1.0 / share(&cells_a, a) + 1.0 / share(&cells_b, b) - 1.0;
             ((a, b), 1.0 / union)
         })
-        .collect()
+        .collect();
+    Some(strengths)
 }

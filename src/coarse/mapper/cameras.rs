@@ -83,7 +83,7 @@ impl Mapper<'_> {
             let free = FreeIntrinsics { focal: true, ..FreeIntrinsics::default() };
             config.intrinsics.insert(freed.images()[id].camera, free);
         }
-        bundle::adjust(&mut freed, &config, &self.options.global_bundle);
+        bundle::adjust_while(&mut freed, &config, &self.options.global_bundle, self.keep_going);
         let options = &self.options.pose.sharing;
         let stays = |id: &ImageId| {
             let (own, given) = (freed.camera_of(*id), self.model.camera_of(*id));

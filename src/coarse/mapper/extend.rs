@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::{CoarseModels, Mapper, MapperInput, MapperOptions, empty_model, reconstruct};
+use crate::bundle::KeepGoing;
 use crate::coarse::Tracks;
 use crate::scene::{ImageId, Reconstruction};
 
@@ -14,7 +15,7 @@ pub fn extend(
     models: &CoarseModels,
     options: &MapperOptions,
     seed: u64,
-    keep_going: &(dyn Fn() -> bool + Sync),
+    keep_going: &KeepGoing,
     progress: &(dyn Fn(usize) + Sync),
 ) -> CoarseModels {
     let images_of = |model: &Reconstruction| -> BTreeSet<ImageId> { model.images().keys().copied().collect() };
@@ -28,10 +29,10 @@ pub fn extend(
     let mut extended = CoarseModels { models: Vec::new(), unregistered: models.unregistered.clone() };
     for (model, component) in models.models.iter().zip(&placed) {
         let graph = input.graph.restricted_to(component);
-        let tracks = Tracks::build(&graph, &input.apart);
-        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, seed);
+        let tracks = Tracks::build(&graph, &input.apart, keep_going);
+        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, seed, keep_going);
         mapper.adopt(model);
-        mapper.grow(keep_going, progress);
+        mapper.grow(progress);
         for (image, reason) in mapper.reasons() {
             extended.unregistered.insert(image, reason);
         }

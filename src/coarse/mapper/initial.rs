@@ -29,6 +29,9 @@ impl Mapper<'_> {
             let pairs: Vec<(ImageId, ImageId)> =
                 fitting.take(self.options.initial_trials).map(|candidate| candidate.pair).collect();
             for pair in pairs {
+                if !(self.keep_going)() {
+                    return false;
+                }
                 used.insert(pair);
                 if self.try_pair(pair) {
                     return true;

@@ -23,6 +23,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::{MatchGraph, Tracks};
+use crate::bundle::KeepGoing;
 use crate::camera::{Camera, Pixel};
 use crate::scene::{ApartImages, CameraId, ImageId, Point3dId, Reconstruction};
 
@@ -79,13 +80,13 @@ pub struct CoarseModels {
     pub unregistered: BTreeMap<ImageId, Unregistered>,
 }
 
-/// Reconstructs every component of the graph. `keep_going` is asked between registrations; once it says no, what there is so
-/// far is returned. `progress` is told the number of images registered.
+/// Reconstructs every component of the graph. `keep_going` is asked at every registration and every step of an adjustment; once it
+/// says no, what there is so far is returned. `progress` is told the number of images registered.
 pub fn reconstruct(
     input: &MapperInput,
     options: &MapperOptions,
     seed: u64,
-    keep_going: &(dyn Fn() -> bool + Sync),
+    keep_going: &KeepGoing,
     progress: &(dyn Fn(usize) + Sync),
 ) -> CoarseModels {
     let mut result = CoarseModels::default();
@@ -128,19 +129,19 @@ fn best_model(
     component: &BTreeSet<ImageId>,
     options: &MapperOptions,
     seed: u64,
-    keep_going: &(dyn Fn() -> bool + Sync),
+    keep_going: &KeepGoing,
     progress: &(dyn Fn(usize) + Sync),
 ) -> Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> {
     let graph = input.graph.restricted_to(component);
-    let tracks = Tracks::build(&graph, &input.apart);
+    let tracks = Tracks::build(&graph, &input.apart, keep_going);
     let mut used_starts = BTreeSet::new();
     let mut best: Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> = None;
     for _ in 0..options.max_starts {
-        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, seed);
+        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, seed, keep_going);
         if !mapper.start(&mut used_starts) {
             break;
         }
-        mapper.grow(keep_going, progress);
+        mapper.grow(progress);
         let registered = mapper.model.images().len();
         if registered >= options.min_model_images
             && best.as_ref().is_none_or(|(model, _)| registered > model.images().len())
@@ -170,6 +171,7 @@ pub(super) struct Mapper<'a> {
     component: &'a BTreeSet<ImageId>,
     options: &'a MapperOptions,
     seed: u64,
+    keep_going: &'a KeepGoing<'a>,
     model: Reconstruction,
     /// The last point each track was given; it may have been filtered since.
     point_of_track: Vec<Option<Point3dId>>,
@@ -187,6 +189,7 @@ impl<'a> Mapper<'a> {
         component: &'a BTreeSet<ImageId>,
         options: &'a MapperOptions,
         seed: u64,
+        keep_going: &'a KeepGoing<'a>,
     ) -> Self {
         Self {
             input,
@@ -195,6 +198,7 @@ impl<'a> Mapper<'a> {
             component,
             options,
             seed,
+            keep_going,
             model: empty_model(input),
             point_of_track: vec![None; tracks.tracks.len()],
             trials: BTreeMap::new(),
@@ -204,10 +208,10 @@ impl<'a> Mapper<'a> {
     }
 
     /// Registers image after image until none can be, then adjusts everything.
-    fn grow(&mut self, keep_going: &(dyn Fn() -> bool + Sync), progress: &(dyn Fn(usize) + Sync)) {
+    fn grow(&mut self, progress: &(dyn Fn(usize) + Sync)) {
         let mut adjusted_at = (self.model.images().len(), self.model.num_points());
         let mut min_inliers = self.options.min_pose_inliers;
-        while keep_going() {
+        while (self.keep_going)() {
             progress(self.model.images().len());
             let Some(image) = self.register_next(min_inliers) else {
                 let size = (self.model.images().len(), self.model.num_points());

@@ -41,7 +41,9 @@ impl Mapper<'_> {
             }
         }
         ranking.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
-        ranking.into_iter().map(|(_, image)| image).find(|&image| self.try_register(image, min_inliers))
+        let keep_going = self.keep_going;
+        let mut in_turn = ranking.into_iter().map(|(_, image)| image).take_while(|_| keep_going());
+        in_turn.find(|&image| self.try_register(image, min_inliers))
     }
 
     /// Schönberger and Frahm's score: over pyramid levels of 2^l x 2^l cells, the occupied cells weighted by their number a

@@ -75,7 +75,10 @@ impl Mapper<'_> {
         let this = &*self;
         let found: Vec<Option<(Vector3<f64>, Vec<Observation>)>> = tracks
             .par_iter()
-            .map(|&track| if this.live_point(track).is_some() { None } else { this.find_point(track) })
+            .map(|&track| {
+                let is_missing = this.live_point(track).is_none() && (this.keep_going)();
+                is_missing.then(|| this.find_point(track)).flatten()
+            })
             .collect();
         let mut added = 0;
         for (&track, found) in tracks.iter().zip(found) {
