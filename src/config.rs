@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 pub use network::{InvalidNetwork, IpNetwork};
+use rustls_pki_types::CertificateDer;
 
 use crate::store::ArchiveLimits;
 
@@ -85,6 +86,8 @@ impl Default for ConnectionLimits {
 pub struct WebhookPolicy {
     /// Addresses they may lead to besides those of the public internet.
     pub allowed: Vec<IpNetwork>,
+    /// Certificates of authorities that are trusted besides those the system trusts.
+    pub trusted: Vec<CertificateDer<'static>>,
     /// Time for one request, from the host's name to the end of the answer.
     pub timeout: Duration,
     /// Time until the second attempt; later ones wait longer.
@@ -97,6 +100,7 @@ impl Default for WebhookPolicy {
     fn default() -> Self {
         Self {
             allowed: Vec::new(),
+            trusted: Vec::new(),
             timeout: Duration::from_secs(10),
             first_pause: Duration::from_secs(5),
             max_attempts: 14,

@@ -8,6 +8,7 @@ mod service;
 use std::collections::BTreeSet;
 use std::io::{BufRead, Read};
 use std::path::Path;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use multistage::store::{DataDir, Db, Scope, create_token};
@@ -197,6 +198,59 @@ async fn a_task_in_one_request_and_without_a_length() {
     let form = Form::new().part("images", file("all.zip", &zip)).part("images", file("seed.zip", b"no zip at all"));
     let answer = client.post("/task/new", form).await;
     assert_eq!(client.completed(answer["uuid"].as_str().unwrap()).await["imagesCount"], 2);
+}
+
+/// Listens where tasks tell of their end; gives the bodies it was sent.
+async fn hook() -> (String, Arc<Mutex<Vec<Value>>>) {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}/done", listener.local_addr().unwrap());
+    let heard = Arc::new(Mutex::new(Vec::new()));
+    let kept = Arc::clone(&heard);
+    let hear = async move |headers: axum::http::HeaderMap, axum::Json(body): axum::Json<Value>| {
+        assert!(!headers.contains_key("x-multistage-signature"), "there is no secret to sign by");
+        kept.lock().unwrap().push(body);
+    };
+    tokio::spawn(async move { axum::serve(listener, axum::Router::new().fallback(hear)).await });
+    (url, heard)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn webhooks_hear_of_a_tasks_end_and_reach_public_addresses_alone() {
+    let service = Service::start_in(tempfile::tempdir().unwrap(), |config| {
+        config.nodeodm_bind = Some(config.bind);
+        config.webhooks.allowed = vec!["127.0.0.1".parse().unwrap()];
+    })
+    .await;
+    let client = Client::of(&service);
+    let (url, heard) = hook().await;
+    let named = || Form::new().text("name", "a task").text("webhook", url.clone());
+    // In three steps, and in one.
+    let begun = client.post("/task/new/init", named()).await["uuid"].as_str().unwrap().to_owned();
+    client.post(&format!("/task/new/upload/{begun}"), photographs(["a.jpg", "b.jpg"])).await;
+    client.commit(&begun).await;
+    let whole = client.post("/task/new", named().part("images", file("a.jpg", b"one"))).await;
+    let whole = whole["uuid"].as_str().unwrap().to_owned();
+    for (id, images) in [(&begun, 2), (&whole, 1)] {
+        let info = client.completed(id).await;
+        for _ in 0..500 {
+            if heard.lock().unwrap().iter().any(|told| told["uuid"] == **id) {
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        let all = heard.lock().unwrap().clone();
+        let told: Vec<_> = all.iter().filter(|told| told["uuid"] == **id).collect();
+        assert_eq!(told.len(), 1, "of its end alone: {all:#?}");
+        for field in ["name", "dateCreated", "processingTime", "status", "imagesCount", "progress"] {
+            assert_eq!(told[0][field].as_f64(), info[field].as_f64(), "{field}");
+            assert_eq!(told[0][field].as_str(), info[field].as_str(), "{field}");
+        }
+        assert_eq!((&told[0]["status"], &told[0]["imagesCount"]), (&json!({"code": 40}), &json!(images)));
+    }
+    for within in ["http://10.0.0.1/x", "http://[::1]/x", "file:///etc/passwd"] {
+        let form = Form::new().text("webhook", within);
+        assert!(error_of(&client.post("/task/new/init", form).await).contains("webhook"), "{within}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

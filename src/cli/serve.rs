@@ -9,6 +9,8 @@ use std::time::Duration;
 
 use clap::ValueEnum;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use rustls_pki_types::CertificateDer;
+use rustls_pki_types::pem::PemObject;
 use tokio::signal::unix::{SignalKind, signal};
 use tracing_subscriber::EnvFilter;
 
@@ -39,6 +41,10 @@ pub(super) struct Args {
     /// Address or network, such as 10.1.0.0/16, that webhooks may lead to besides the public internet; may be given again.
     #[arg(long = "webhook-allow", env = "MULTISTAGE_WEBHOOK_ALLOW", value_delimiter = ',')]
     webhook_allow: Vec<IpNetwork>,
+    /// File of certificates (PEM) of authorities that https webhooks are trusted by, besides those of the system; may be given
+    /// again.
+    #[arg(long = "webhook-ca", env = "MULTISTAGE_WEBHOOK_CA", value_delimiter = ',', value_name = "FILE.pem", value_parser = read_certificates)]
+    webhook_ca: Vec<Certificates>,
     /// Requests a second that one token may send, on average [default: 500].
     #[arg(long, env = "MULTISTAGE_REQUESTS_PER_S")]
     requests_per_s: Option<NonZeroU32>,
@@ -99,6 +105,7 @@ impl Args {
         let wanted = self.max_connections.map_or(connections.max_connections, NonZeroUsize::get);
         connections.max_connections = wanted.min(connections_that_fit());
         config.webhooks.allowed.clone_from(&self.webhook_allow);
+        config.webhooks.trusted = self.webhook_ca.iter().flat_map(|file| file.0.iter().cloned()).collect();
         let access = &mut config.access;
         let on_this_machine =
             self.bind.ip().is_loopback() && self.nodeodm_bind.is_none_or(|bind| bind.ip().is_loopback());
@@ -112,6 +119,16 @@ impl Args {
         uploads.max_files = self.max_files.map_or(uploads.max_files, NonZeroUsize::get);
         config
     }
+}
+
+/// The certificates of one file.
+#[derive(Clone, Debug)]
+struct Certificates(Vec<CertificateDer<'static>>);
+
+fn read_certificates(file: &str) -> Result<Certificates, String> {
+    let read = CertificateDer::pem_file_iter(file).map_err(|error| error.to_string())?;
+    let certificates = read.collect::<Result<Vec<_>, _>>().map_err(|error| error.to_string())?;
+    if certificates.is_empty() { Err("it holds no certificate".to_owned()) } else { Ok(Certificates(certificates)) }
 }
 
 /// Open files that the database, uploads, downloads and jobs need besides connections.

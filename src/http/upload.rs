@@ -66,7 +66,7 @@ impl Form {
         match self {
             Self::Photographs => &[],
             Self::Job => &["name", "options", "priority", "webhook"],
-            Self::NodeOdm => &["name", "options", "zipurl"],
+            Self::NodeOdm => &["name", "options", "webhook", "zipurl"],
         }
     }
 }

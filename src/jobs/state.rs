@@ -40,6 +40,17 @@ impl JobState {
         Self::ALL.into_iter().find(|state| state.as_str() == name)
     }
 
+    /// The number that clients of NodeODM know the state by.
+    pub fn nodeodm_code(self) -> u32 {
+        match self {
+            Self::Queued => 10,
+            Self::Running => 20,
+            Self::Failed => 30,
+            Self::Succeeded => 40,
+            Self::Cancelled => 50,
+        }
+    }
+
     /// Whether nothing will happen to the job any more unless somebody asks.
     pub fn is_final(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)

@@ -17,6 +17,7 @@ use crate::http::problem::{Code, Problem};
 use crate::http::submission::{Order, submit};
 use crate::http::upload::{Form, Parts, Received, receive};
 use crate::jobs::view::time_text;
+use crate::jobs::webhooks::NewWebhook;
 use crate::jobs::{JobsError, NewJob};
 use crate::store::db::nodeodm_tasks::{self, NodeOdmTaskRow};
 use crate::store::db::{datasets, now_ms, tokens};
@@ -45,14 +46,15 @@ fn wanted_id(headers: &HeaderMap) -> Result<Uuid, Problem> {
     }
 }
 
-/// Name and options of a task.
-fn read(received: &Received) -> Result<Order, Problem> {
+/// Name, options and webhook of a task.
+fn read(state: &AppState, received: &Received) -> Result<Order, Problem> {
     if received.text("zipurl").is_some() {
         return Err(Problem::new(Code::BadRequest).detail("zipurl is not supported: send the photographs"));
     }
     let name = received.text("name").map_or_else(|| format!("Task of {}", time_text(now_ms())), str::to_owned);
     let options = received.text("options").map_or(Value::Null, |text| Value::String(text.to_owned()));
-    Ok(Order { name, options: options::read(&options)?, priority: 0, webhook: None })
+    let webhook = received.text("webhook").map(|url| NewWebhook::of_task(url, &state.config.webhooks)).transpose()?;
+    Ok(Order { name, options: options::read(&options)?, priority: 0, webhook })
 }
 
 /// Whether a task with this id is a job already; an error when it is somebody else's.
@@ -78,7 +80,7 @@ async fn begin(State(state): State<AppState>, principal: Principal, request: Req
     let id = wanted_id(request.headers())?;
     // Photographs do not come yet, so the dataset they would go to need not be there.
     let received = receive(&state, Parts::of(request).await?, Uuid::nil(), Form::NodeOdm).await?;
-    let Order { name, options, .. } = read(&received)?;
+    let Order { name, options, webhook, .. } = read(&state, &received)?;
     state.jobs.check(&name, &options)?;
     if is_committed(&state, &principal, id).await? {
         return Err(taken());
@@ -91,6 +93,7 @@ async fn begin(State(state): State<AppState>, principal: Principal, request: Req
         options: options.to_string(),
         touched_ms: now,
         owner_token: owner.map(|token| token.to_string()),
+        webhook: webhook.map(|webhook| webhook.url().to_owned()),
     };
     let mut tx = store.db.write().await?;
     match nodeodm_tasks::find(&mut *tx, id).await? {
@@ -137,6 +140,7 @@ async fn commit(
         // Sent again, because the answer was lost.
         return if is_committed(&state, &principal, id).await? { Ok(named(id)) } else { Err(unknown(&uuid)) };
     };
+    let webhook = task.webhook.as_deref().map(|url| NewWebhook::of_task(url, &state.config.webhooks)).transpose()?;
     let new = NewJob {
         id,
         // The dataset has it.
@@ -146,7 +150,7 @@ async fn commit(
         ignored: None,
         priority: 0,
         owner_token: principal.owner(),
-        webhook: None,
+        webhook,
     };
     match state.jobs.enqueue(new).await {
         Ok(_) => Ok(named(id)),
@@ -162,6 +166,6 @@ async fn at_once(State(state): State<AppState>, principal: Principal, request: R
     if is_committed(&state, &principal, id).await? || find_open(&state, &principal, id).await?.is_some() {
         return Err(taken());
     }
-    submit(&state, &principal, id, Parts::of(request).await?, Form::NodeOdm, read).await?;
+    submit(&state, &principal, id, Parts::of(request).await?, Form::NodeOdm, |received| read(&state, received)).await?;
     Ok(named(id))
 }

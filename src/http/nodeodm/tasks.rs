@@ -64,17 +64,6 @@ async fn list(State(state): State<AppState>, principal: Principal) -> Result<Res
     Ok(axum::Json(tasks).into_response())
 }
 
-/// A number that these clients know a state by.
-fn status_code(state: JobState) -> u32 {
-    match state {
-        JobState::Queued => 10,
-        JobState::Running => 20,
-        JobState::Failed => 30,
-        JobState::Succeeded => 40,
-        JobState::Cancelled => 50,
-    }
-}
-
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
 struct TaskInfo {
@@ -126,7 +115,7 @@ async fn info(
         name: row.name,
         date_created: row.created_ms,
         processing_time: row.started_ms.map_or(-1, |start| (until - start).max(0)),
-        status: Status { code: status_code(now), error_message: row.error_message },
+        status: Status { code: now.nodeodm_code(), error_message: row.error_message },
         options: options::chosen(&serde_json::from_str(&row.options).unwrap_or_default()),
         images_count: images.uploaded,
         progress: if now == JobState::Succeeded { 100.0 } else { 100.0 * share_done(&stages) },

@@ -4,7 +4,6 @@
 use std::io;
 use std::net::SocketAddr;
 use std::sync::{Arc, OnceLock};
-use std::time::Duration;
 
 use bytes::Bytes;
 use http_body_util::{BodyExt, Full, Limited};
@@ -13,12 +12,12 @@ use hyper_util::rt::TokioIo;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
-use tokio_rustls::rustls::pki_types::ServerName;
+use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
 use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
 use url::Position;
 
 use super::target::{InvalidTarget, Target, may_connect};
-use crate::config::IpNetwork;
+use crate::config::{IpNetwork, WebhookPolicy};
 
 /// Bytes of an answer that are read, so that the other side can end it properly.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
@@ -63,22 +62,23 @@ pub(super) struct Message {
 /// Sends a message and gives the answer's status.
 pub(super) async fn send(
     resolver: &impl Resolve,
+    trust: &Trust,
     target: &Target,
-    allowed: &[IpNetwork],
+    policy: &WebhookPolicy,
     message: Message,
-    timeout: Duration,
 ) -> Result<StatusCode, SendError> {
     let sent = async {
-        let stream = connect(resolver, target, allowed).await?;
+        let stream = connect(resolver, target, &policy.allowed).await?;
         if !target.is_encrypted() {
             return exchange(stream, target, message).await;
         }
         let name = ServerName::try_from(target.host()).map_err(io::Error::other).map_err(SendError::Connect)?;
-        let tls = TlsConnector::from(tls().map_err(io::Error::other).map_err(SendError::Connect)?);
+        let tls =
+            TlsConnector::from(trust.config(&policy.trusted).map_err(io::Error::other).map_err(SendError::Connect)?);
         let stream = tls.connect(name, stream).await.map_err(SendError::Connect)?;
         exchange(stream, target, message).await
     };
-    tokio::time::timeout(timeout, sent).await.map_err(|_| SendError::Timeout)?
+    tokio::time::timeout(policy.timeout, sent).await.map_err(|_| SendError::Timeout)?
 }
 
 /// Connects to the first of the host's addresses that takes the connection, provided that all of them are acceptable: a name with
@@ -126,27 +126,35 @@ async fn exchange(
     status
 }
 
-/// TLS by the certificates that the system trusts, read once.
-fn tls() -> Result<Arc<ClientConfig>, rustls::Error> {
-    static CONFIG: OnceLock<Result<Arc<ClientConfig>, rustls::Error>> = OnceLock::new();
-    let config = CONFIG.get_or_init(|| {
-        let found = rustls_native_certs::load_native_certs();
-        for error in found.errors {
-            tracing::warn!(%error, "a trusted certificate of the system can't be read");
-        }
-        let mut roots = RootCertStore::empty();
-        roots.add_parsable_certificates(found.certs);
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let config = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
-        Ok(Arc::new(config.with_root_certificates(roots).with_no_client_auth()))
-    });
-    config.clone()
+/// TLS by the certificates that the system trusts and those of the settings; read when the first https webhook is called.
+#[derive(Default)]
+pub(super) struct Trust(OnceLock<Result<Arc<ClientConfig>, rustls::Error>>);
+
+impl Trust {
+    fn config(&self, trusted: &[CertificateDer<'static>]) -> Result<Arc<ClientConfig>, rustls::Error> {
+        let config = self.0.get_or_init(|| {
+            let found = rustls_native_certs::load_native_certs();
+            for error in found.errors {
+                tracing::warn!(%error, "a trusted certificate of the system can't be read");
+            }
+            let mut roots = RootCertStore::empty();
+            roots.add_parsable_certificates(found.certs);
+            for certificate in trusted {
+                roots.add(certificate.clone())?;
+            }
+            let provider = Arc::new(rustls::crypto::ring::default_provider());
+            let config = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
+            Ok(Arc::new(config.with_root_certificates(roots).with_no_client_auth()))
+        });
+        config.clone()
+    }
 }
 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
     use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::time::Duration;
 
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     use tokio::net::TcpListener;
@@ -182,20 +190,24 @@ mod tests {
         }
     }
 
+    fn policy(timeout: Duration) -> WebhookPolicy {
+        WebhookPolicy { allowed: vec!["127.0.0.2".parse().unwrap()], timeout, ..WebhookPolicy::default() }
+    }
+
     /// 127.0.0.2 stands for the public internet, 127.0.0.1 for what is within.
     #[tokio::test]
     async fn the_connection_goes_to_the_address_that_was_judged() {
         let (public, heard) = listener("127.0.0.2:0", "HTTP/1.1 204 No Content\r\n\r\n").await;
         let (within, canary) = listener("127.0.0.1:0", "HTTP/1.1 200 OK\r\n\r\n").await;
-        let allowed = ["127.0.0.2".parse().unwrap()];
-        let target = Target::parse("http://rebinding.example/hook", &allowed).unwrap();
+        let policy = policy(Duration::from_secs(5));
+        let target = Target::parse("http://rebinding.example/hook", &policy.allowed).unwrap();
         let send = async |answers: &[&[SocketAddr]]| {
             let answers: Vec<_> = answers.iter().map(|answer| answer.to_vec()).collect();
             let (count, resolver) = (answers.len(), Fickle { answers, asked: AtomicUsize::new(0) });
             let mut results = Vec::new();
             for _ in 0..count {
                 let message = Message { headers: Vec::new(), body: "{}".to_owned() };
-                results.push(send(&resolver, &target, &allowed, message, Duration::from_secs(5)).await);
+                results.push(send(&resolver, &Trust::default(), &target, &policy, message).await);
             }
             assert_eq!(resolver.asked.into_inner(), count, "a name is asked for once a request");
             results
@@ -215,18 +227,18 @@ mod tests {
         let redirect = format!("HTTP/1.1 307 Elsewhere\r\nlocation: http://{within}/\r\ncontent-length: 0\r\n\r\n");
         let (public, _) = listener("127.0.0.2:0", Box::leak(redirect.into_boxed_str())).await;
         let (silent, _) = listener("127.0.0.2:0", "").await;
-        let allowed = ["127.0.0.2".parse().unwrap()];
+        let policy = policy(Duration::from_millis(500));
         let ask = async |address: SocketAddr| {
-            let target = Target::parse(&format!("http://{address}/x?y=z#w"), &allowed).unwrap();
+            let target = Target::parse(&format!("http://{address}/x?y=z#w"), &policy.allowed).unwrap();
             let message = Message { headers: Vec::new(), body: "{}".to_owned() };
-            send(&SystemResolver, &target, &allowed, message, Duration::from_millis(500)).await
+            send(&SystemResolver, &Trust::default(), &target, &policy, message).await
         };
         assert!(matches!(ask(public).await, Ok(StatusCode::TEMPORARY_REDIRECT)));
         assert!(ask(silent).await.is_err());
         // Who speaks no TLS is not spoken to without.
-        let target = Target::parse(&format!("https://{public}/"), &allowed).unwrap();
+        let target = Target::parse(&format!("https://{public}/"), &policy.allowed).unwrap();
         let message = Message { headers: Vec::new(), body: "{}".to_owned() };
-        let plain = send(&SystemResolver, &target, &allowed, message, Duration::from_secs(5)).await;
+        let plain = send(&SystemResolver, &Trust::default(), &target, &policy, message).await;
         assert!(matches!(plain, Err(SendError::Connect(_))), "{plain:?}");
         assert_eq!(canary.load(Ordering::SeqCst), 0);
     }

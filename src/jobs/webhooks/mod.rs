@@ -1,6 +1,7 @@
 //! Tells addresses of a job's changes of state: signed, in order, again and again until they answer or it is given up. What is to
 //! be told stands in the database, written with the change itself, so it survives the end of the process.
 
+mod body;
 mod client;
 mod target;
 
@@ -10,15 +11,15 @@ use std::time::Duration;
 
 use futures_util::future::join_all;
 use hmac::{Hmac, KeyInit, Mac};
-use serde_json::{Value, json};
 use sha2::Sha256;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use self::client::{Message, SendError, SystemResolver, send};
+use self::body::body;
+use self::client::{Message, SendError, SystemResolver, Trust, send};
 use super::{Jobs, JobsError};
 use crate::config::WebhookPolicy;
-use crate::store::db::webhooks::{self, DueRow, WebhookRow};
+use crate::store::db::webhooks::{self, Audience, DueRow, WebhookRow};
 use crate::store::db::{jobs, now_ms};
 
 /// Webhooks of one job.
@@ -46,6 +47,7 @@ fn pause(policy: &WebhookPolicy, attempts: u32) -> Duration {
 pub struct NewWebhook {
     target: Target,
     secret: String,
+    audience: Audience,
 }
 
 impl NewWebhook {
@@ -60,7 +62,21 @@ impl NewWebhook {
             let (least, most) = (SECRET_CHARS.start(), SECRET_CHARS.end());
             return Err(JobsError::InvalidWebhook(format!("a webhook's secret has from {least} to {most} letters")));
         }
-        Ok(Self { target, secret: secret.to_owned() })
+        Ok(Self { target, secret: secret.to_owned(), audience: Audience::Jobs })
+    }
+
+    /// Checks the address of a client of NodeODM, which is told of its task's end alone and unsigned.
+    ///
+    /// # Errors
+    /// Why it is refused.
+    pub fn of_task(url: &str, policy: &WebhookPolicy) -> Result<Self, JobsError> {
+        let target = Target::parse(url, &policy.allowed)?;
+        Ok(Self { target, secret: String::new(), audience: Audience::NodeOdm })
+    }
+
+    /// Its address.
+    pub fn url(&self) -> &str {
+        self.target.url().as_str()
     }
 
     /// The row of a webhook of this job.
@@ -71,6 +87,7 @@ impl NewWebhook {
             url: self.target.url().to_string(),
             secret: self.secret.clone(),
             created_ms: now_ms(),
+            audience: self.audience,
         }
     }
 }
@@ -94,10 +111,10 @@ impl Jobs {
 
     /// Calls webhooks until `shutdown`.
     pub async fn call_webhooks(self, policy: WebhookPolicy, shutdown: CancellationToken) {
-        let mut changes = self.hub.changes();
+        let (mut changes, trust) = (self.hub.changes(), Trust::default());
         loop {
             changes.mark_unchanged();
-            let pause = match self.call_due(&policy).await {
+            let pause = match self.call_due(&policy, &trust).await {
                 Ok(pause) => pause,
                 Err(error) => {
                     tracing::warn!(%error, "webhooks can't be called");
@@ -113,7 +130,7 @@ impl Jobs {
     }
 
     /// Calls every webhook that is due and tells how long to wait for the next.
-    async fn call_due(&self, policy: &WebhookPolicy) -> sqlx::Result<Duration> {
+    async fn call_due(&self, policy: &WebhookPolicy, trust: &Trust) -> sqlx::Result<Duration> {
         let db = &self.store.db;
         let due = webhooks::due(db.reader(), now_ms(), PARALLEL).await?;
         if due.is_empty() {
@@ -121,7 +138,7 @@ impl Jobs {
             let wait = next.map_or(IDLE_POLL, |next| Duration::from_millis((next - now_ms()).max(0).unsigned_abs()));
             return Ok(wait.min(IDLE_POLL));
         }
-        let calls = join_all(due.iter().map(|delivery| call(policy, delivery))).await;
+        let calls = join_all(due.iter().map(|delivery| call(policy, trust, delivery))).await;
         let mut tx = db.write().await?;
         for (due, answer) in due.into_iter().zip(calls) {
             webhooks::update_delivery(&mut tx, &after(policy, due, answer)).await?;
@@ -129,21 +146,6 @@ impl Jobs {
         tx.commit().await?;
         Ok(Duration::ZERO)
     }
-}
-
-/// What is told.
-fn body(due: &DueRow) -> String {
-    let event: Value = serde_json::from_str(&due.data).unwrap_or_default();
-    json!({
-        "webhook_id": due.delivery.webhook_id,
-        "event_id": due.delivery.event_id,
-        "job_id": due.job_id,
-        "name": due.job_name,
-        "state": event["state"],
-        "at": event["at"],
-        "error": event["error"],
-    })
-    .to_string()
 }
 
 /// `t=<seconds since 1970>,v1=<HMAC-SHA256 of "<seconds>.<body>" in hexadecimal>`.
@@ -155,17 +157,20 @@ fn signature(secret: &str, seconds: i64, body: &str) -> String {
     format!("t={seconds},v1={code}")
 }
 
-async fn call(policy: &WebhookPolicy, due: &DueRow) -> Result<u16, SendError> {
+async fn call(policy: &WebhookPolicy, trust: &Trust, due: &DueRow) -> Result<u16, SendError> {
     // The list of allowed addresses may have changed since it was made.
     let target = Target::parse(&due.url, &policy.allowed)?;
     let body = body(due);
-    let headers = vec![
-        ("x-multistage-event", "job.state".to_owned()),
-        ("x-multistage-delivery", format!("{}/{}", due.delivery.webhook_id, due.delivery.event_id)),
-        ("x-multistage-signature", signature(&due.secret, jiff::Timestamp::now().as_second(), &body)),
-    ];
+    let headers = match due.audience {
+        Audience::Jobs => vec![
+            ("x-multistage-event", "job.state".to_owned()),
+            ("x-multistage-delivery", format!("{}/{}", due.delivery.webhook_id, due.delivery.event_id)),
+            ("x-multistage-signature", signature(&due.secret, jiff::Timestamp::now().as_second(), &body)),
+        ],
+        Audience::NodeOdm => Vec::new(),
+    };
     let message = Message { headers, body };
-    Ok(send(&SystemResolver, &target, &policy.allowed, message, policy.timeout).await?.as_u16())
+    Ok(send(&SystemResolver, trust, &target, policy, message).await?.as_u16())
 }
 
 /// The row of a delivery after an attempt.

@@ -17,24 +17,29 @@ pub struct NodeOdmTaskRow {
     pub touched_ms: i64,
     /// Whose it is.
     pub owner_token: Option<String>,
+    /// The address to tell of its end.
+    pub webhook: Option<String>,
 }
 
 /// Adds a task.
 pub async fn insert(db: &mut SqliteConnection, task: &NodeOdmTaskRow) -> sqlx::Result<()> {
-    sqlx::query("INSERT INTO nodeodm_tasks (id, dataset_id, options, touched_ms, owner_token) VALUES (?, ?, ?, ?, ?)")
-        .bind(&task.id)
-        .bind(&task.dataset_id)
-        .bind(&task.options)
-        .bind(task.touched_ms)
-        .bind(&task.owner_token)
-        .execute(db)
-        .await?;
+    sqlx::query(
+        "INSERT INTO nodeodm_tasks (id, dataset_id, options, touched_ms, owner_token, webhook) VALUES (?, ?, ?, ?, ?, ?)",
+    )
+    .bind(&task.id)
+    .bind(&task.dataset_id)
+    .bind(&task.options)
+    .bind(task.touched_ms)
+    .bind(&task.owner_token)
+    .bind(&task.webhook)
+    .execute(db)
+    .await?;
     Ok(())
 }
 
 /// One task.
 pub async fn find(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<Option<NodeOdmTaskRow>> {
-    sqlx::query_as("SELECT id, dataset_id, options, touched_ms, owner_token FROM nodeodm_tasks WHERE id = ?")
+    sqlx::query_as("SELECT id, dataset_id, options, touched_ms, owner_token, webhook FROM nodeodm_tasks WHERE id = ?")
         .bind(id.to_string())
         .fetch_optional(db)
         .await

@@ -3,6 +3,16 @@
 use sqlx::{FromRow, SqliteConnection, SqliteExecutor};
 use uuid::Uuid;
 
+/// Who listens to a webhook.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, sqlx::Type)]
+#[sqlx(rename_all = "lowercase")]
+pub enum Audience {
+    /// Hears of every change of state, signed.
+    Jobs,
+    /// Hears of a task's end alone, in the words of NodeODM.
+    NodeOdm,
+}
+
 /// An address that is told of a job's changes of state.
 #[derive(Clone, Debug, PartialEq, Eq, FromRow)]
 pub struct WebhookRow {
@@ -12,10 +22,12 @@ pub struct WebhookRow {
     pub job_id: String,
     /// Where it is.
     pub url: String,
-    /// Signs what is sent.
+    /// Signs what is sent; empty for clients of NodeODM.
     pub secret: String,
     /// When it was made.
     pub created_ms: i64,
+    /// Who listens.
+    pub audience: Audience,
 }
 
 /// A change of state on its way to an address.
@@ -47,24 +59,35 @@ pub struct DueRow {
     pub delivery: DeliveryRow,
     /// Where to.
     pub url: String,
-    /// Signs it.
+    /// Signs it; empty for clients of NodeODM.
     pub secret: String,
+    /// Who listens.
+    pub audience: Audience,
     /// The job it is about.
     pub job_id: String,
     /// The job's name.
     pub job_name: String,
+    /// When the job was made.
+    pub created_ms: i64,
+    /// When it began.
+    pub started_ms: Option<i64>,
+    /// When it ended.
+    pub finished_ms: Option<i64>,
+    /// Its photographs.
+    pub images: i64,
     /// The event's data, JSON.
     pub data: String,
 }
 
 /// Adds a webhook; it hears of every later change.
 pub async fn insert(db: &mut SqliteConnection, webhook: &WebhookRow) -> sqlx::Result<()> {
-    sqlx::query("INSERT INTO webhooks (id, job_id, url, secret, created_ms) VALUES (?, ?, ?, ?, ?)")
+    sqlx::query("INSERT INTO webhooks (id, job_id, url, secret, created_ms, audience) VALUES (?, ?, ?, ?, ?, ?)")
         .bind(&webhook.id)
         .bind(&webhook.job_id)
         .bind(&webhook.url)
         .bind(&webhook.secret)
         .bind(webhook.created_ms)
+        .bind(webhook.audience)
         .execute(db)
         .await?;
     Ok(())
@@ -72,7 +95,7 @@ pub async fn insert(db: &mut SqliteConnection, webhook: &WebhookRow) -> sqlx::Re
 
 /// The webhooks of a job, oldest first.
 pub async fn list(db: impl SqliteExecutor<'_>, job: Uuid) -> sqlx::Result<Vec<WebhookRow>> {
-    sqlx::query_as("SELECT id, job_id, url, secret, created_ms FROM webhooks WHERE job_id = ? ORDER BY id")
+    sqlx::query_as("SELECT id, job_id, url, secret, created_ms, audience FROM webhooks WHERE job_id = ? ORDER BY id")
         .bind(job.to_string())
         .fetch_all(db)
         .await
@@ -103,7 +126,8 @@ pub async fn deliveries(db: impl SqliteExecutor<'_>, job: Uuid) -> sqlx::Result<
 /// changes in their order.
 pub async fn due(db: impl SqliteExecutor<'_>, now_ms: i64, limit: u32) -> sqlx::Result<Vec<DueRow>> {
     sqlx::query_as(
-        "SELECT d.*, w.url, w.secret, w.job_id, j.name AS job_name, e.data
+        "SELECT d.*, w.url, w.secret, w.audience, w.job_id, j.name AS job_name, j.created_ms, j.started_ms, j.finished_ms,
+                (SELECT COUNT(*) FROM job_images i WHERE i.job_id = j.id) AS images, e.data
          FROM webhook_deliveries d
          JOIN webhooks w ON w.id = d.webhook_id
          JOIN jobs j ON j.id = w.job_id
