@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod program;
 mod service;
 
 #[path = "operations/directory.rs"]

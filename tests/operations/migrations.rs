@@ -1,12 +1,14 @@
-//! Databases of every earlier schema come up to date with all they hold.
+//! Databases of every earlier schema come up to date with all they hold, also when the program is killed over it.
 
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use multistage::store::{DataDir, Db};
 use sqlx::SqlitePool;
 use sqlx::migrate::Migrator;
 use sqlx::sqlite::SqliteConnectOptions;
 
+use crate::program::Program;
 use crate::service::Service;
 
 const DATASET: &str = "01999999-0000-7000-8000-00000000000d";
@@ -99,4 +101,90 @@ async fn every_earlier_schema_comes_up_to_date_with_its_rows() {
         }
         db.close().await;
     }
+}
+
+/// Rows that make a migration take its time.
+const MANY: i64 = 60_000;
+/// Kills while a database is migrated.
+const KILLS: u32 = 24;
+
+/// Rows of every table, and migrations that are done, in a database as the last process left it.
+async fn rows_and_migrations(data_dir: &Path) -> ([i64; 4], i64) {
+    let options = SqliteConnectOptions::new().filename(DataDir::database_in(data_dir));
+    let pool = SqlitePool::connect_with(options).await.unwrap();
+    let verdict: String = sqlx::query_scalar("PRAGMA integrity_check").fetch_one(&pool).await.unwrap();
+    assert_eq!(verdict, "ok");
+    let count = async |table: &str| -> i64 {
+        let sql = sqlx::AssertSqlSafe(format!("SELECT COUNT(*) FROM {table}"));
+        sqlx::query_scalar(sql).fetch_one(&pool).await.unwrap()
+    };
+    let rows = [
+        count("datasets").await,
+        count("dataset_images").await,
+        count("jobs WHERE state = 'succeeded'").await,
+        count("job_events").await,
+    ];
+    let migrations = count("_sqlx_migrations WHERE success").await;
+    pool.close().await;
+    (rows, migrations)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_kill_in_the_middle_of_a_migration_loses_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let old = folder.path().join("old.db");
+    old_database(&old, 1).await;
+    let pool = SqlitePool::connect_with(SqliteConnectOptions::new().filename(&old)).await.unwrap();
+    for many in [
+        "INSERT INTO datasets (id, seq, name, created_ms) SELECT 'd' || n, n + 1, 'many', 1000 FROM numbers".to_owned(),
+        format!(
+            "INSERT INTO dataset_images (dataset_id, path, size_bytes, sha256) SELECT '{DATASET}', 'm' || n, 5, 'ab' FROM numbers"
+        ),
+        format!(
+            "INSERT INTO jobs (id, seq, name, state, created_ms, started_ms, finished_ms, dataset_id, options, models)
+             SELECT 'j' || n, n + 1, 'many', 'succeeded', 1000, 2000, 3000, '{DATASET}', '{{}}', '[]' FROM numbers"
+        ),
+        "INSERT INTO job_events (job_id, id, kind, data) SELECT 'j' || n, 1, 'state', '{}' FROM numbers".to_owned(),
+    ] {
+        let numbers = "WITH RECURSIVE numbers (n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM numbers WHERE n < ?) ";
+        let sql = sqlx::AssertSqlSafe(format!("{numbers}{many}"));
+        sqlx::query(sql).bind(MANY).execute(&pool).await.unwrap();
+    }
+    pool.close().await;
+    let all = i64::try_from(migrations().len()).unwrap();
+    let fresh = |name: &str| {
+        let data = folder.path().join(name);
+        std::fs::create_dir(&data).unwrap();
+        std::fs::copy(&old, DataDir::database_in(&data)).unwrap();
+        data
+    };
+    let undisturbed = fresh("undisturbed");
+    let start = Instant::now();
+    Program::start(&undisturbed).kill();
+    let takes = start.elapsed();
+    let (expected, done) = rows_and_migrations(&undisturbed).await;
+    assert_eq!((expected, done), ([MANY + 1; 4], all));
+
+    let mut left_at = std::collections::BTreeMap::new();
+    let mut data = fresh("killed-0");
+    for kill in 0..KILLS {
+        let mut program = Program::spawn(&data);
+        // Moments all over the time that it takes, in another order than that of time.
+        let share = f64::from((kill * 7) % KILLS) / f64::from(KILLS);
+        std::thread::sleep(Duration::from_millis(2) + takes.mul_f64(share));
+        program.kill().unwrap();
+        program.wait().unwrap();
+        let (rows, done) = rows_and_migrations(&data).await;
+        assert_eq!(rows, expected, "after kill {kill}");
+        *left_at.entry(done).or_insert(0) += 1;
+        if done == all || kill % 3 == 2 {
+            // It comes up from where the kill left it.
+            Program::start(&data).kill();
+            assert_eq!(rows_and_migrations(&data).await, (expected, all), "after kill {kill}");
+            data = fresh(&format!("killed-{}", kill + 1));
+        }
+    }
+    println!("migrating takes {takes:.2?}; migrations done when it was killed, and how often: {left_at:?}");
+    let halfway: i32 = left_at.iter().filter(|(done, _)| (1..all).contains(*done)).map(|(_, count)| count).sum();
+    assert!(halfway >= 3, "too few kills came in the middle: {left_at:?}");
 }

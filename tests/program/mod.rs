@@ -43,6 +43,17 @@ impl Program {
         Self { base: base.trim_end_matches('/').to_owned(), output, child }
     }
 
+    /// Starts it and does not wait for anything.
+    pub fn spawn(data_dir: &Path) -> Child {
+        Command::new(env!("CARGO_BIN_EXE_multistage"))
+            .args(["serve", "--bind", "127.0.0.1:0", "--data-dir"])
+            .arg(data_dir)
+            .env("RUST_LOG", "error")
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap()
+    }
+
     /// The process.
     pub fn id(&self) -> u32 {
         self.child.id()
