@@ -10,6 +10,7 @@ use axum::http::StatusCode;
 
 use super::problem::Code;
 use crate::jobs::{JobState, StageSums, Sums};
+use crate::store::db::write::{CLASSES_MS, WriteFigures};
 
 /// What the process counts.
 #[derive(Debug)]
@@ -31,6 +32,8 @@ pub(super) struct Readings {
     pub(super) oldest_wait_s: Option<f64>,
     /// What jobs took.
     pub(super) sums: Sums,
+    /// What writes to the database took.
+    pub(super) writes: WriteFigures,
     /// Room on the disk, where it tells.
     pub(super) disk_free_bytes: Option<u64>,
 }
@@ -74,7 +77,7 @@ impl Metrics {
 
     /// Everything as text.
     pub(super) fn text(&self, readings: &Readings) -> String {
-        let Readings { jobs, oldest_wait_s, sums, disk_free_bytes } = readings;
+        let Readings { jobs, oldest_wait_s, sums, writes, disk_free_bytes } = readings;
         let mut text = String::new();
         let mut family = |name: &str, kind: &str, help: &str, samples: &[(String, String)]| {
             // Writing into a string can't fail.
@@ -139,9 +142,33 @@ impl Metrics {
         family("multistage_job_images_per_second", "gauge", "Photographs per second of those runs.", &rate);
         let problems = labelled("code", &mut self.problems().iter().map(|(code, count)| (*code, *count)));
         family("multistage_http_problems_total", "counter", "Problems answered, by code.", &problems);
+        family(
+            "multistage_store_write_seconds",
+            "histogram",
+            "Time of writes to the database, in their queue too, without the disk's syncs.",
+            &histogram(writes),
+        );
+        let syncs = plain(format!("{:.3}", writes.syncs.as_secs_f64()));
+        family("multistage_store_sync_seconds_total", "counter", "Time in which a sync was under way.", &syncs);
         if let Some(free) = disk_free_bytes {
             family("multistage_disk_free_bytes", "gauge", "Room on the disk.", &plain(free.to_string()));
         }
         text
     }
+}
+
+/// The samples of a histogram, by what follows its name.
+fn histogram(writes: &WriteFigures) -> Vec<(String, String)> {
+    let mut count = 0;
+    let ends = CLASSES_MS.iter().map(|end_ms| (*end_ms as f64 / 1000.0).to_string()).chain(["+Inf".to_owned()]);
+    let mut samples: Vec<_> = ends
+        .zip(&writes.counts)
+        .map(|(end, more)| {
+            count += more;
+            (format!("_bucket{{le=\"{end}\"}}"), count.to_string())
+        })
+        .collect();
+    samples.push(("_sum".to_owned(), format!("{:.6}", writes.time.as_secs_f64())));
+    samples.push(("_count".to_owned(), count.to_string()));
+    samples
 }

@@ -317,10 +317,7 @@ impl Intake {
         if files.is_empty() {
             return Ok(());
         }
-        // In a task of its own, so that a sender who leaves can't leave it half done.
-        let (store, dataset) = (Arc::clone(&self.store), self.dataset);
-        let commit = tokio::spawn(async move { store.commit_images(dataset, files).await });
-        let Committed { stored, unchanged } = commit.await.map_err(|panic| Problem::internal(&panic))??;
+        let Committed { stored, unchanged } = self.store.commit_images(self.dataset, files).await?;
         self.received.stored += stored;
         self.received.unchanged += unchanged;
         Ok(())

@@ -4,12 +4,16 @@ mod archive;
 mod artifacts;
 pub(crate) mod atomic;
 mod backup;
+mod claims;
 pub mod db;
 mod doctor;
 mod file_name;
+mod folders;
+mod group_commit;
 mod incoming;
 mod layout;
 mod outputs;
+mod placing;
 mod quota;
 mod resumable;
 mod space;
@@ -17,16 +21,21 @@ mod token;
 
 use std::io;
 use std::path::Path;
+use std::sync::Arc;
 
 pub use archive::{ArchiveError, ArchiveLimits, unpack};
 pub use artifacts::ArtifactStore;
 pub use backup::{BackedUp, back_up};
+use claims::Claims;
 pub use db::Db;
 pub use doctor::{Finding, examine};
 pub use file_name::{ImagePath, InvalidFileName};
-pub use incoming::{Committed, StagedFile, StagedWriter};
+use folders::DurableFolders;
+use group_commit::GroupCommit;
+pub use incoming::{StagedFile, StagedWriter};
 pub use layout::DataDir;
 pub use outputs::Checksums;
+pub use placing::Committed;
 pub(crate) use quota::check as check_quota;
 pub use quota::{Quantity, Quota};
 pub use resumable::{Appender, NewUpload, UploadError, UploadKind};
@@ -41,6 +50,9 @@ pub struct Store {
     /// Files.
     pub data: DataDir,
     reservations: Reservations,
+    group: GroupCommit,
+    claims: Claims,
+    folders: Arc<DurableFolders>,
 }
 
 /// Why the store refused or failed.
@@ -112,7 +124,8 @@ impl Store {
     pub async fn open(root: &Path) -> Result<Self, StoreError> {
         let data = DataDir::open(root)?;
         let db = Db::open(&data.database()).await?;
-        Ok(Self { db, data, reservations: Reservations::default() })
+        let group = GroupCommit::start(&db);
+        Ok(Self { db, data, reservations: Reservations::default(), group, claims: Claims::default(), folders: Arc::default() })
     }
 
     /// Removes the folders of deleted jobs and datasets. What can't be removed stays on the list for the next time and is told to

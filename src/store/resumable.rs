@@ -7,6 +7,7 @@
 use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 use sqlx::SqliteConnection;
@@ -15,6 +16,7 @@ use uuid::Uuid;
 use super::db::uploads::UploadRow;
 use super::db::{dataset_images, now_ms, uploads};
 use super::incoming::{StagedFile, hex};
+use super::placing::check_writable;
 use super::{ImagePath, Quantity, Store, StoreError, atomic, check_quota};
 
 /// Bytes copied at a time.
@@ -98,7 +100,6 @@ impl From<io::Error> for UploadError {
 
 /// Appends to the file of an upload. Blocking.
 pub struct Appender {
-    path: PathBuf,
     file: File,
     size_bytes: u64,
     failure: Option<io::Error>,
@@ -122,13 +123,12 @@ impl Appender {
         self.failure.is_none()
     }
 
-    /// Makes what was written durable; gives the file's length then, and the failure that ended the writing.
+    /// Makes the bytes that were written durable; gives the file's length then, and the failure that ended the writing.
     ///
     /// # Errors
     /// When nothing can be said about what is durable.
     pub fn finish(self) -> io::Result<(u64, Option<io::Error>)> {
         self.file.sync_data()?;
-        atomic::sync_parent(&self.path)?;
         Ok((self.size_bytes, self.failure))
     }
 }
@@ -140,10 +140,10 @@ impl Store {
     /// What the system said.
     pub fn append_upload(&self, id: Uuid, offset: u64) -> io::Result<Appender> {
         let path = self.data.upload(id);
-        let mut file = File::options().create(true).truncate(false).write(true).open(&path)?;
+        let mut file = File::options().create(true).truncate(false).write(true).open(path)?;
         file.set_len(offset)?;
         file.seek(SeekFrom::Start(offset))?;
-        Ok(Appender { path, file, size_bytes: offset, failure: None })
+        Ok(Appender { file, size_bytes: offset, failure: None })
     }
 
     /// Adds an upload without bytes.
@@ -151,38 +151,12 @@ impl Store {
     /// # Errors
     /// A dataset that takes nothing now, a path stored with another length, or what the store said.
     pub async fn create_upload(&self, new: NewUpload) -> Result<UploadRow, UploadError> {
-        let mut tx = self.db.write().await?;
-        let row = self.insert_upload(&mut tx, new).await?;
-        tx.commit().await?;
-        Ok(row)
-    }
-
-    async fn insert_upload(&self, tx: &mut SqliteConnection, new: NewUpload) -> Result<UploadRow, UploadError> {
-        if let Some((dataset, path)) = &new.target {
-            self.check_writable(tx, *dataset).await?;
-            let there = dataset_images::find(&mut *tx, *dataset, path.as_str()).await?;
-            if there.is_some_and(|there| new.length.is_some_and(|length| i64::try_from(length) != Ok(there.size_bytes)))
-            {
-                return Err(UploadError::Conflict(path.to_string()));
-            }
-        }
-        let row = UploadRow {
-            id: Uuid::now_v7().to_string(),
-            created_ms: now_ms(),
-            expires_ms: new.expires_ms,
-            kind: new.kind.as_str().to_owned(),
-            length: new.length.map(to_i64),
-            offset: 0,
-            metadata: new.metadata,
-            concat: new.concat,
-            dataset_id: new.target.as_ref().map(|(dataset, _)| dataset.to_string()),
-            path: new.target.map(|(_, path)| path.to_string()),
-            stored: false,
-            owner_token: new.owner_token.map(|token| token.to_string()),
-        };
-        uploads::insert(tx, &row).await?;
-        check_quota(tx, row.owner_token.as_deref(), &[Quantity::Bytes, Quantity::Images]).await?;
-        Ok(row)
+        let new = Arc::new(new);
+        let created = self.group.commit(Vec::new(), move |tx| {
+            let new = Arc::clone(&new);
+            Box::pin(async move { insert_upload(tx, &new).await })
+        });
+        created.await
     }
 
     /// Adds an upload whose bytes are those of `parts`, in order; the parts stay.
@@ -208,7 +182,7 @@ impl Store {
             return Err(UploadError::TooLong(max_bytes));
         }
         new.length = Some(length);
-        let mut row = self.insert_upload(&mut tx, new).await?;
+        let mut row = insert_upload(&mut tx, &new).await?;
         tx.commit().await?;
         let id = upload_id(&row)?;
         let (target, sources) = (self.data.upload(id), parts.iter().map(|part| self.data.upload(*part)));
@@ -218,7 +192,7 @@ impl Store {
         match copied {
             Ok(copied) if copied == length => {
                 row.offset = to_i64(length);
-                self.save_upload(&row).await?;
+                self.save_upload(&row, false).await?;
                 Ok(row)
             }
             other => {
@@ -237,22 +211,26 @@ impl Store {
         if row.expires_ms <= now_ms() { Err(UploadError::Expired) } else { Ok(row) }
     }
 
-    /// Writes the row of an upload, whose bytes are durable.
+    /// Writes the row of an upload, whose bytes are durable; with `is_new`, the entry of its file is made durable before.
     ///
     /// # Errors
-    /// What SQLite said.
-    pub async fn save_upload(&self, row: &UploadRow) -> Result<(), StoreError> {
-        let mut tx = self.db.write().await?;
-        uploads::update(&mut tx, row).await?;
-        tx.commit().await?;
-        Ok(())
+    /// What the system or SQLite said.
+    pub async fn save_upload(&self, row: &UploadRow, is_new: bool) -> Result<(), StoreError> {
+        let folders = if is_new { vec![self.data.uploads()] } else { Vec::new() };
+        let row = Arc::new(row.clone());
+        let saved = self.group.commit(folders, move |tx| {
+            let row = Arc::clone(&row);
+            Box::pin(async move { Ok(uploads::update(tx, &row).await?) })
+        });
+        saved.await
     }
 
-    /// Puts a complete upload into its dataset. Asking again is no error; for a partial or incomplete one nothing happens.
+    /// Puts a complete upload, whose bytes are durable, into its dataset and writes its row. Asking again is no error; for a partial or
+    /// incomplete one nothing happens.
     ///
     /// # Errors
     /// [`UploadError::Conflict`], after which the upload is gone; a dataset that takes nothing now; what the store said.
-    pub async fn store_upload(&self, row: &mut UploadRow) -> Result<(), UploadError> {
+    pub async fn store_upload(self: &Arc<Self>, row: &mut UploadRow) -> Result<(), UploadError> {
         let (Some(dataset), Some(path)) = (&row.dataset_id, &row.path) else { return Ok(()) };
         if row.stored || row.length != Some(row.offset) {
             return Ok(());
@@ -263,33 +241,19 @@ impl Store {
         let (file, scratch, size_bytes) = (self.data.upload(id), self.data.incoming(), to_u64(row.offset));
         let staged = tokio::task::spawn_blocking(move || stage(&file, &scratch, path, size_bytes));
         let staged = staged.await.map_err(io::Error::other)??;
-        let mut tx = self.db.write().await?;
-        // First, so that no quota counts it twice.
         let stored = UploadRow { stored: true, ..row.clone() };
-        uploads::update(&mut tx, &stored).await?;
-        let (_, conflict) = match self.place_images(&mut tx, dataset, vec![staged]).await {
-            Err(StoreError::FileConflict(path)) => return self.refuse(tx, id, path).await,
-            other => other?,
-        };
-        if let Some(path) = conflict {
-            return self.refuse(tx, id, path.to_string()).await;
+        match self.place_upload(dataset, staged, stored).await {
+            Ok(()) => {}
+            // A sender who asks for the state of a refused upload must not learn that all its bytes came, so it goes.
+            Err(StoreError::FileConflict(path)) => {
+                self.remove_upload(id).await?;
+                return Err(UploadError::Conflict(path));
+            }
+            Err(error) => return Err(error.into()),
         }
-        tx.commit().await?;
-        *row = stored;
+        row.stored = true;
         self.forget_file(id).await;
         Ok(())
-    }
-
-    /// A sender who asks for the state of a refused upload must not learn that all its bytes came, so it goes.
-    async fn refuse(
-        &self,
-        tx: sqlx::Transaction<'static, sqlx::Sqlite>,
-        id: Uuid,
-        path: String,
-    ) -> Result<(), UploadError> {
-        tx.rollback().await?;
-        self.remove_upload(id).await?;
-        Err(UploadError::Conflict(path))
     }
 
     /// Removes an upload; whether it was there.
@@ -335,6 +299,33 @@ impl Store {
     }
 }
 
+async fn insert_upload(tx: &mut SqliteConnection, new: &NewUpload) -> Result<UploadRow, UploadError> {
+    if let Some((dataset, path)) = &new.target {
+        check_writable(tx, *dataset).await?;
+        let there = dataset_images::find(&mut *tx, *dataset, path.as_str()).await?;
+        if there.is_some_and(|there| new.length.is_some_and(|length| i64::try_from(length) != Ok(there.size_bytes))) {
+            return Err(UploadError::Conflict(path.to_string()));
+        }
+    }
+    let row = UploadRow {
+        id: Uuid::now_v7().to_string(),
+        created_ms: now_ms(),
+        expires_ms: new.expires_ms,
+        kind: new.kind.as_str().to_owned(),
+        length: new.length.map(to_i64),
+        offset: 0,
+        metadata: new.metadata.clone(),
+        concat: new.concat.clone(),
+        dataset_id: new.target.as_ref().map(|(dataset, _)| dataset.to_string()),
+        path: new.target.as_ref().map(|(_, path)| path.to_string()),
+        stored: false,
+        owner_token: new.owner_token.map(|token| token.to_string()),
+    };
+    uploads::insert(tx, &row).await?;
+    check_quota(tx, row.owner_token.as_deref(), &[Quantity::Bytes, Quantity::Images]).await?;
+    Ok(row)
+}
+
 /// The id of a row, which was written from one.
 pub(crate) fn upload_id(row: &UploadRow) -> Result<Uuid, StoreError> {
     row.id.parse().map_err(|_| sqlx::Error::Decode(format!("{:?} is no id", row.id).into()).into())
@@ -357,7 +348,9 @@ fn stage(file: &Path, scratch: &Path, path: ImagePath, size_bytes: u64) -> io::R
     if io::copy(&mut reader, &mut HashWriter(&mut hash))? != size_bytes {
         return Err(io::Error::new(io::ErrorKind::UnexpectedEof, "an upload's file lost bytes"));
     }
-    source.sync_all()?;
+    if size_bytes == 0 {
+        source.sync_all()?;
+    }
     StagedFile::link(file, scratch, path, size_bytes, hex(&hash.finalize()))
 }
 

@@ -127,10 +127,16 @@ async fn the_figures_count_jobs_stages_bytes_and_problems() {
     assert_eq!(value("multistage_upload_images_total"), 10.0);
     assert!(value("multistage_queue_oldest_wait_seconds") > 0.0);
     assert!(value("multistage_disk_free_bytes") > 0.0);
+    let writes = value("multistage_store_write_seconds_count");
+    assert!(writes > 10.0 && value("multistage_store_write_seconds_bucket{le=\"+Inf\"}") == writes);
+    assert!(value("multistage_store_write_seconds_bucket{le=\"0.001\"}") <= writes);
+    assert!(value("multistage_store_sync_seconds_total") > 0.0);
     assert_eq!(value("multistage_stage_wall_seconds_total{stage=\"intake\"}"), 0.5);
     // Every family has its help and its type, once.
     for line in text.lines().filter(|line| !line.starts_with('#')) {
         let name = line.split(['{', ' ']).next().unwrap();
+        // A histogram is one family of several names.
+        let name = ["_bucket", "_sum", "_count"].iter().find_map(|end| name.strip_suffix(end)).unwrap_or(name);
         for word in ["HELP", "TYPE"] {
             assert_eq!(text.matches(&format!("# {word} {name} ")).count(), 1, "{name}");
         }

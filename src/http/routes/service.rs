@@ -60,6 +60,7 @@ async fn metrics(State(state): State<AppState>) -> Result<Response, Problem> {
         jobs: jobs::count_by_state(reader).await?,
         oldest_wait_s: oldest_ms.map(|since| (now_ms() - since).max(0) as f64 / 1000.0),
         sums: state.jobs.figures.sums(),
+        writes: state.jobs.store.db.write_figures(),
         disk_free_bytes: state.jobs.store.disk_free_bytes().ok(),
     };
     let media_type = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];

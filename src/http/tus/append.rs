@@ -15,7 +15,7 @@ use uuid::Uuid;
 
 use super::{Checksum, UploadGuard};
 use crate::http::problem::{Code, Problem};
-use crate::store::Store;
+use crate::store::{Store, UploadError};
 use crate::store::db::now_ms;
 use crate::store::db::uploads::UploadRow;
 
@@ -61,11 +61,21 @@ struct Segment {
 
 /// Takes the body in, counts what came, and puts a complete upload into its dataset; gives its row.
 pub(in crate::http) async fn append(mut request: Append, body: Body) -> Result<(UploadRow, UploadGuard), Problem> {
-    let stored = take_in(&mut request, body).await;
-    if stored.is_ok() {
-        request.store.store_upload(&mut request.row).await?;
+    let before = request.row.clone();
+    let taken = take_in(&mut request, body).await;
+    let Append { store, row, .. } = &mut request;
+    if taken.is_ok() && row.length == Some(row.offset) && row.dataset_id.is_some() {
+        // Which counts the last bytes too, so that they wait for the disk once.
+        if let Err(error) = store.store_upload(row).await {
+            if !matches!(error, UploadError::Conflict(_)) {
+                store.save_upload(row, before.offset == 0).await?;
+            }
+            return Err(error.into());
+        }
+    } else if *row != before {
+        store.save_upload(row, before.offset == 0).await?;
     }
-    stored.map(|()| (request.row, request.guard))
+    taken.map(|()| (request.row, request.guard))
 }
 
 async fn take_in(request: &mut Append, body: Body) -> Result<(), Problem> {
@@ -119,7 +129,11 @@ async fn take_in(request: &mut Append, body: Body) -> Result<(), Problem> {
             let (durable, failure) = close(segment).await?;
             // Bytes of a body that is too long, or under a checksum that has not spoken yet, do not count.
             if request.checksum.is_none() && !matches!(end, Some(End::TooLong)) {
-                count(request, durable).await?;
+                count(request, durable);
+                // What ends the request is written with its end.
+                if end.is_none() && failure.is_none() {
+                    request.store.save_upload(&request.row, start == 0).await?;
+                }
             }
             if let Some(error) = failure {
                 return Err(error.into());
@@ -134,12 +148,12 @@ async fn take_in(request: &mut Append, body: Body) -> Result<(), Problem> {
             if !checksum.holds() {
                 return Err(Problem::new(Code::ChecksumMismatch).detail("the bytes are not those of the checksum"));
             }
-            count(request, arrived).await?;
+            count(request, arrived);
         }
         // Bytes that can't be checked any more.
         (Some(_), _) => {}
         // The first bytes, or none, may complete a length that was told just now.
-        (None, _) if arrived == start => count(request, start).await?,
+        (None, _) if arrived == start => count(request, start),
         (None, _) => {}
     }
     match end {
@@ -175,8 +189,8 @@ async fn close(segment: Segment) -> Result<(u64, Option<std::io::Error>), Proble
     Ok(segment.writing.await.map_err(|panic| Problem::internal(&panic))??)
 }
 
-async fn count(request: &mut Append, offset: u64) -> Result<(), Problem> {
+/// Notes in the row what is durable.
+fn count(request: &mut Append, offset: u64) {
     request.row.offset = i64::try_from(offset).unwrap_or(i64::MAX);
     request.row.expires_ms = now_ms() + i64::try_from(request.expiry.as_millis()).unwrap_or(i64::MAX / 2);
-    Ok(request.store.save_upload(&request.row).await?)
 }

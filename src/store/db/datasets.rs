@@ -55,6 +55,13 @@ pub async fn find(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<Option<
     .await
 }
 
+/// Whether there is such a dataset.
+pub async fn exists(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<bool> {
+    let found: Option<i64> =
+        sqlx::query_scalar("SELECT 1 FROM datasets WHERE id = ?").bind(id.to_string()).fetch_optional(db).await?;
+    Ok(found.is_some())
+}
+
 /// Datasets older than the one with `seq` `before`, newest first, of one token or of all. One whose upload is not complete yet is
 /// left out.
 pub async fn list(

@@ -17,14 +17,17 @@ pub mod nodeodm_tasks;
 pub mod tokens;
 pub mod uploads;
 pub mod webhooks;
+pub mod write;
 
 use std::path::Path;
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use sqlx::migrate::Migrator;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{Connection, Sqlite, SqlitePool, Transaction};
+use sqlx::{Connection, SqlitePool};
+
+use write::{Stopwatch, WaitsFor, WriteFigures, WriteTimes, WriteTransaction};
 
 static MIGRATIONS: Migrator = sqlx::migrate!("./migrations");
 
@@ -36,6 +39,7 @@ const READERS: u32 = 4;
 pub struct Db {
     reader: SqlitePool,
     writer: SqlitePool,
+    times: Arc<WriteTimes>,
 }
 
 impl Db {
@@ -72,7 +76,7 @@ impl Db {
             .acquire_timeout(Duration::from_secs(60))
             .connect_with(options.read_only(true).create_if_missing(false))
             .await?;
-        Ok(Self { reader, writer })
+        Ok(Self { reader, writer, times: Arc::default() })
     }
 
     /// For single reads.
@@ -84,8 +88,27 @@ impl Db {
     ///
     /// # Errors
     /// What SQLite said.
-    pub async fn write(&self) -> Result<Transaction<'static, Sqlite>, sqlx::Error> {
-        self.writer.begin_with("BEGIN IMMEDIATE").await
+    pub async fn write(&self) -> Result<WriteTransaction, sqlx::Error> {
+        let stopwatch = Stopwatch::start(&self.times, WaitsFor::Commits);
+        Ok(WriteTransaction { stopwatch: Some(stopwatch), ..self.write_untimed().await? })
+    }
+
+    /// The same for whoever times what it does itself.
+    ///
+    /// # Errors
+    /// What SQLite said.
+    pub(in crate::store) async fn write_untimed(&self) -> Result<WriteTransaction, sqlx::Error> {
+        let inner = self.writer.begin_with("BEGIN IMMEDIATE").await?;
+        Ok(WriteTransaction { inner, times: Arc::clone(&self.times), stopwatch: None })
+    }
+
+    /// What writes took since the start.
+    pub fn write_figures(&self) -> WriteFigures {
+        self.times.figures()
+    }
+
+    pub(in crate::store) fn times(&self) -> &Arc<WriteTimes> {
+        &self.times
     }
 
     /// Closes every connection.

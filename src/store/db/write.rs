@@ -1,0 +1,250 @@
+//! Transactions that write: one at a time, each timed.
+//!
+//! How long a write takes has two causes that want different cures: the disk, which syncs as fast as it does, and everything else,
+//! which is ours. So the time of a write is counted without the time in which the writer waited for the disk.
+
+use std::ops::{Deref, DerefMut};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use sqlx::{Sqlite, SqliteConnection, Transaction};
+
+/// Upper ends of the classes that writes are counted in, in milliseconds; one more class has no end.
+pub const CLASSES_MS: [u64; 10] = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
+
+/// What writes took.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct WriteFigures {
+    /// Writes by class, each up to the end of [`CLASSES_MS`] with its number, and the rest.
+    pub counts: [u64; CLASSES_MS.len() + 1],
+    /// Time of all writes from the request to the answer, syncs left out.
+    pub time: Duration,
+    /// Time in which the disk was waited for.
+    pub syncs: Duration,
+}
+
+impl WriteFigures {
+    /// The end of the class, in milliseconds, within which a share of all writes lies; none beyond the last or without any.
+    pub fn within_ms(&self, share: f64) -> Option<u64> {
+        let wanted = (self.counts.iter().sum::<u64>() as f64 * share).ceil();
+        let mut count = 0;
+        CLASSES_MS.iter().zip(&self.counts).find_map(|(end_ms, more)| {
+            count += more;
+            (count > 0 && count as f64 >= wanted).then_some(*end_ms)
+        })
+    }
+}
+
+/// Runs while at least one sync is under way.
+#[derive(Debug, Default)]
+struct SyncClock(Mutex<Syncs>);
+
+#[derive(Debug, Default)]
+struct Syncs {
+    over: Duration,
+    open: usize,
+    since: Option<Instant>,
+}
+
+impl SyncClock {
+    fn syncs(&self) -> MutexGuard<'_, Syncs> {
+        // A panic elsewhere can't leave the clock half changed.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn read(&self) -> Duration {
+        let syncs = self.syncs();
+        syncs.over + syncs.since.map_or(Duration::ZERO, |since| since.elapsed())
+    }
+
+    fn start(&self) {
+        let mut syncs = self.syncs();
+        syncs.open += 1;
+        syncs.since.get_or_insert_with(Instant::now);
+    }
+
+    fn stop(&self) {
+        let mut syncs = self.syncs();
+        syncs.open -= 1;
+        if syncs.open == 0
+            && let Some(since) = syncs.since.take()
+        {
+            syncs.over += since.elapsed();
+        }
+    }
+}
+
+/// What is known of the times of writes.
+#[derive(Debug, Default)]
+pub(in crate::store) struct WriteTimes {
+    figures: Mutex<WriteFigures>,
+    /// Of commits alone, which every writer waits for.
+    commits: SyncClock,
+    /// Of commits, and of folders that are synced for the commit after.
+    all: SyncClock,
+}
+
+/// Which syncs a write waits for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::store) enum WaitsFor {
+    /// Commits.
+    Commits,
+    /// Commits, and folders before them.
+    FoldersToo,
+}
+
+impl WriteTimes {
+    /// What writes took so far.
+    pub(in crate::store) fn figures(&self) -> WriteFigures {
+        let figures = *self.figures.lock().unwrap_or_else(PoisonError::into_inner);
+        WriteFigures { syncs: self.all.read(), ..figures }
+    }
+
+    fn clock(&self, waits_for: WaitsFor) -> &SyncClock {
+        match waits_for {
+            WaitsFor::Commits => &self.commits,
+            WaitsFor::FoldersToo => &self.all,
+        }
+    }
+}
+
+/// Times one write until it is dropped.
+#[derive(Debug)]
+pub(in crate::store) struct Stopwatch {
+    times: Arc<WriteTimes>,
+    waits_for: WaitsFor,
+    start: Instant,
+    syncs: Duration,
+}
+
+impl Stopwatch {
+    pub(in crate::store) fn start(times: &Arc<WriteTimes>, waits_for: WaitsFor) -> Self {
+        let syncs = times.clock(waits_for).read();
+        Self { times: Arc::clone(times), waits_for, start: Instant::now(), syncs }
+    }
+}
+
+impl Drop for Stopwatch {
+    fn drop(&mut self) {
+        let syncs = self.times.clock(self.waits_for).read().saturating_sub(self.syncs);
+        let time = self.start.elapsed().saturating_sub(syncs);
+        let class = CLASSES_MS.iter().position(|end_ms| time <= Duration::from_millis(*end_ms));
+        let mut figures = self.times.figures.lock().unwrap_or_else(PoisonError::into_inner);
+        figures.counts[class.unwrap_or(CLASSES_MS.len())] += 1;
+        figures.time += time;
+    }
+}
+
+/// A sync under way, until it is dropped.
+pub(in crate::store) struct Syncing {
+    times: Arc<WriteTimes>,
+    is_commit: bool,
+}
+
+impl Syncing {
+    pub(in crate::store) fn folders(times: &Arc<WriteTimes>) -> Self {
+        Self::start(times, false)
+    }
+
+    fn start(times: &Arc<WriteTimes>, is_commit: bool) -> Self {
+        times.all.start();
+        if is_commit {
+            times.commits.start();
+        }
+        Self { times: Arc::clone(times), is_commit }
+    }
+}
+
+impl Drop for Syncing {
+    fn drop(&mut self) {
+        self.times.all.stop();
+        if self.is_commit {
+            self.times.commits.stop();
+        }
+    }
+}
+
+/// A transaction that may write; undone when dropped.
+pub struct WriteTransaction {
+    pub(super) inner: Transaction<'static, Sqlite>,
+    pub(super) times: Arc<WriteTimes>,
+    /// None where whoever asked is timed.
+    pub(super) stopwatch: Option<Stopwatch>,
+}
+
+impl WriteTransaction {
+    /// Makes it durable.
+    ///
+    /// # Errors
+    /// What SQLite said.
+    pub async fn commit(self) -> sqlx::Result<()> {
+        let Self { inner, times, stopwatch } = self;
+        let syncing = Syncing::start(&times, true);
+        let committed = inner.commit().await;
+        drop(syncing);
+        drop(stopwatch);
+        committed
+    }
+
+    /// Undoes it.
+    ///
+    /// # Errors
+    /// What SQLite said.
+    pub async fn rollback(self) -> sqlx::Result<()> {
+        self.inner.rollback().await
+    }
+}
+
+impl Deref for WriteTransaction {
+    type Target = SqliteConnection;
+
+    fn deref(&self) -> &SqliteConnection {
+        &self.inner
+    }
+}
+
+impl DerefMut for WriteTransaction {
+    fn deref_mut(&mut self) -> &mut SqliteConnection {
+        &mut self.inner
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn a_write_is_counted_without_the_syncs_that_it_waited_for() {
+        let times = Arc::new(WriteTimes::default());
+        let nap = |ms| std::thread::sleep(Duration::from_millis(ms));
+        for (waits_for, is_commit) in
+            [(WaitsFor::Commits, true), (WaitsFor::FoldersToo, true), (WaitsFor::FoldersToo, false)]
+        {
+            let stopwatch = Stopwatch::start(&times, waits_for);
+            let syncing = Syncing::start(&times, is_commit);
+            nap(300);
+            drop(syncing);
+            drop(stopwatch);
+        }
+        let after = times.figures();
+        assert!(after.syncs >= Duration::from_millis(900) && after.time < Duration::from_millis(300), "{after:?}");
+        // Nobody but who waits for folders is spared their time.
+        let stopwatch = Stopwatch::start(&times, WaitsFor::Commits);
+        let syncing = Syncing::folders(&times);
+        nap(300);
+        drop(stopwatch);
+        drop(syncing);
+        assert!(times.figures().time - after.time >= Duration::from_millis(300));
+    }
+
+    #[test]
+    fn shares_lie_within_classes() {
+        let mut figures = WriteFigures::default();
+        assert_eq!(figures.within_ms(0.99), None);
+        figures.counts[1] = 98;
+        figures.counts[5] = 1;
+        figures.counts[CLASSES_MS.len()] = 1;
+        assert_eq!((figures.within_ms(0.98), figures.within_ms(0.99), figures.within_ms(1.0)), (Some(2), Some(50), None));
+    }
+}

@@ -1,0 +1,254 @@
+//! Staged photographs enter their dataset.
+//!
+//! They are renamed into its folder by their own request, side by side with others; then the folders are synced and the rows
+//! committed, together with those of other requests, and then the request is answered. A crash in between leaves at most files
+//! without rows, which nobody was told about; sending the same again mends that.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use sqlx::SqliteConnection;
+use uuid::Uuid;
+
+use super::db::dataset_images::DatasetImageRow;
+use super::db::tokens::{self, Owned};
+use super::db::uploads::UploadRow;
+use super::db::{dataset_images, datasets, jobs, now_ms, uploads};
+use super::{ImagePath, Quantity, StagedFile, Store, StoreError, check_quota};
+
+/// What became of a batch.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Committed {
+    /// Photographs that are new.
+    pub stored: usize,
+    /// Photographs that were there before with the same bytes.
+    pub unchanged: usize,
+}
+
+/// Staged files, compared with what is stored.
+#[derive(Default)]
+struct Sorted {
+    new: Vec<StagedFile>,
+    unchanged: usize,
+    /// The first path that is stored with other bytes; what came after it is left out.
+    conflict: Option<ImagePath>,
+}
+
+impl Store {
+    /// Puts staged files into a dataset, durably, also when whoever asked leaves meanwhile. Stops at a path that is stored with other
+    /// bytes; what came before it stays.
+    ///
+    /// # Errors
+    /// [`StoreError::FileConflict`], [`StoreError::DatasetInUse`] while a job on it is queued or running,
+    /// [`StoreError::NotFound`] without such a dataset, or what the system or SQLite said.
+    pub async fn commit_images(
+        self: &Arc<Self>,
+        dataset: Uuid,
+        files: Vec<StagedFile>,
+    ) -> Result<Committed, StoreError> {
+        self.place(dataset, files, None).await
+    }
+
+    /// The same for the file of a resumable upload, whose row is written with it.
+    pub(super) async fn place_upload(
+        self: &Arc<Self>,
+        dataset: Uuid,
+        file: StagedFile,
+        row: UploadRow,
+    ) -> Result<(), StoreError> {
+        self.place(dataset, vec![file], Some(row)).await.map(|_| ())
+    }
+
+    async fn place(
+        self: &Arc<Self>,
+        dataset: Uuid,
+        files: Vec<StagedFile>,
+        upload: Option<UploadRow>,
+    ) -> Result<Committed, StoreError> {
+        let store = Arc::clone(self);
+        // In a task of its own: between the file and its row nothing may be given up.
+        let placing = tokio::spawn(async move {
+            let paths: BTreeSet<String> = files.iter().map(|file| file.path.as_str().to_owned()).collect();
+            let _claim = store.claims.take(dataset, paths).await;
+            store.place_claimed(dataset, files, upload).await
+        });
+        placing.await.map_err(io::Error::other)?
+    }
+
+    async fn place_claimed(
+        &self,
+        dataset: Uuid,
+        files: Vec<StagedFile>,
+        upload: Option<UploadRow>,
+    ) -> Result<Committed, StoreError> {
+        let sorted = self.sort(dataset, files).await?;
+        let committed = Committed { stored: sorted.new.len(), unchanged: sorted.unchanged };
+        // What an upload stands for is one file: without it there is nothing to note.
+        if committed.stored > 0 || (upload.is_some() && sorted.conflict.is_none()) {
+            self.place_new(dataset, sorted.new, upload).await?;
+        }
+        match sorted.conflict {
+            Some(path) => Err(StoreError::FileConflict(path.to_string())),
+            None => Ok(committed),
+        }
+    }
+
+    async fn sort(&self, dataset: Uuid, files: Vec<StagedFile>) -> Result<Sorted, StoreError> {
+        let mut reader = self.db.reader().acquire().await?;
+        check_writable(&mut reader, dataset).await?;
+        let mut sorted = Sorted::default();
+        let mut known = BTreeMap::<String, String>::new();
+        for file in files {
+            let path = file.path.as_str();
+            if !known.contains_key(path)
+                && let Some(there) = dataset_images::find(&mut *reader, dataset, path).await?
+            {
+                known.insert(there.path, there.sha256);
+            }
+            match known.get(path) {
+                Some(there) if *there == file.sha256 => sorted.unchanged += 1,
+                Some(_) => {
+                    sorted.conflict = Some(file.path);
+                    break;
+                }
+                None => {
+                    known.insert(path.to_owned(), file.sha256.clone());
+                    sorted.new.push(file);
+                }
+            }
+        }
+        Ok(sorted)
+    }
+
+    async fn place_new(
+        &self,
+        dataset: Uuid,
+        files: Vec<StagedFile>,
+        upload: Option<UploadRow>,
+    ) -> Result<(), StoreError> {
+        let rows: Vec<DatasetImageRow> = files.iter().map(row).collect();
+        let (root, folder, folders) =
+            (self.data.root().to_path_buf(), self.data.images(dataset), Arc::clone(&self.folders));
+        let make = move |parent: &Path| folders.make(&root, parent);
+        let moving = tokio::task::spawn_blocking(move || Moved::into(&folder, make, files));
+        let (moved, failure) = moving.await.map_err(io::Error::other)?;
+        let written = match failure {
+            Some(error) => Err(error),
+            None => {
+                let write = Arc::new((rows, upload));
+                let written = self.group.commit(moved.folders(), move |tx| {
+                    let write = Arc::clone(&write);
+                    Box::pin(async move { insert(tx, dataset, &write.0, write.1.as_ref()).await })
+                });
+                written.await
+            }
+        };
+        if let Err(error) = written {
+            return Err(self.withdraw(dataset, moved, error).await);
+        }
+        Ok(())
+    }
+
+    /// Removes files that got no row; gives the reason that counts.
+    async fn withdraw(&self, dataset: Uuid, moved: Moved, error: StoreError) -> StoreError {
+        // A folder that went with its dataset is no failure of the disk, and must not come back with a file in it.
+        let is_gone = matches!(datasets::exists(self.db.reader(), dataset).await, Ok(false));
+        let (data, folder) = (self.data.clone(), self.data.dataset(dataset));
+        let removed = tokio::task::spawn_blocking(move || {
+            if is_gone {
+                return data.discard(&folder);
+            }
+            moved.files.iter().try_for_each(std::fs::remove_file)
+        });
+        if let Err(error) = removed.await.map_err(io::Error::other).and_then(|removed| removed) {
+            tracing::warn!(%dataset, %error, "files that were not taken stay until they are sent again");
+        }
+        if is_gone { StoreError::NotFound } else { error }
+    }
+}
+
+/// Fails unless photographs may be added to a dataset now.
+pub(super) async fn check_writable(db: &mut SqliteConnection, dataset: Uuid) -> Result<(), StoreError> {
+    if !datasets::exists(&mut *db, dataset).await? {
+        return Err(StoreError::NotFound);
+    }
+    if jobs::use_of_dataset(db, dataset).await?.1 {
+        return Err(StoreError::DatasetInUse);
+    }
+    Ok(())
+}
+
+fn row(file: &StagedFile) -> DatasetImageRow {
+    DatasetImageRow {
+        path: file.path.as_str().to_owned(),
+        size_bytes: i64::try_from(file.size_bytes).unwrap_or(i64::MAX),
+        sha256: file.sha256.clone(),
+    }
+}
+
+async fn insert(
+    tx: &mut SqliteConnection,
+    dataset: Uuid,
+    rows: &[DatasetImageRow],
+    upload: Option<&UploadRow>,
+) -> Result<(), StoreError> {
+    check_writable(tx, dataset).await?;
+    if let Some(upload) = upload {
+        // Before the quota is asked, so that nothing counts twice.
+        uploads::update(tx, upload).await?;
+    }
+    if rows.is_empty() {
+        return Ok(());
+    }
+    for row in rows {
+        dataset_images::insert(tx, dataset, row).await?;
+    }
+    datasets::touch(tx, dataset, now_ms()).await?;
+    let owner = tokens::owner(&mut *tx, Owned::Dataset(dataset)).await?.flatten();
+    check_quota(tx, owner.as_deref(), &[Quantity::Bytes, Quantity::Images]).await
+}
+
+/// Files that are in their places.
+#[derive(Debug, Default)]
+struct Moved {
+    files: Vec<PathBuf>,
+}
+
+impl Moved {
+    /// Renames staged files to their places below `folder`, whose folders `make` makes, as far as that goes. Blocking.
+    fn into(
+        folder: &Path,
+        make: impl Fn(&Path) -> io::Result<()>,
+        files: Vec<StagedFile>,
+    ) -> (Self, Option<StoreError>) {
+        let mut moved = Self::default();
+        for file in files {
+            let path = file.path.clone();
+            let target = folder.join(path.as_str());
+            let parent = target.parent().unwrap_or(folder);
+            match make(parent).and_then(|()| file.move_to(&target)) {
+                Ok(()) => moved.files.push(target),
+                Err(error) => {
+                    let error = match error.kind() {
+                        // One name is a folder of the other: `a.jpg` and `a.jpg/b.jpg` can't both be stored.
+                        io::ErrorKind::NotADirectory
+                        | io::ErrorKind::IsADirectory
+                        | io::ErrorKind::AlreadyExists
+                        | io::ErrorKind::DirectoryNotEmpty => StoreError::FileConflict(path.to_string()),
+                        _ => StoreError::Io(error),
+                    };
+                    return (moved, Some(error));
+                }
+            }
+        }
+        (moved, None)
+    }
+
+    /// Where they are.
+    fn folders(&self) -> Vec<PathBuf> {
+        let folders: BTreeSet<&Path> = self.files.iter().filter_map(|file| file.parent()).collect();
+        folders.into_iter().map(Path::to_path_buf).collect()
+    }
+}
