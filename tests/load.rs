@@ -288,8 +288,8 @@ async fn many_photographs_through_tus() {
     drop(program);
     std::fs::remove_dir_all(folder.path().join("data")).unwrap();
     disk += disk_time(folder.path(), files - files / 2, size, CONNECTIONS);
-    let one_by_one = (files.min(ONE_BY_ONE) * size) as f64
-        / disk_time(folder.path(), files.min(ONE_BY_ONE), size, 1).as_secs_f64();
+    let one_by_one =
+        (files.min(ONE_BY_ONE) * size) as f64 / disk_time(folder.path(), files.min(ONE_BY_ONE), size, 1).as_secs_f64();
     let disk = (files * size) as f64 / disk.as_secs_f64();
     let share = rate / disk;
     let least = if wanted.is_some() { SHARE_OF_DISK } else { SHARE_OF_DISK_SHORT };

@@ -3,15 +3,18 @@
 //! A commit waits for the disk, and one that waits can take others along: requests hand their writes to one task, which syncs the
 //! folders that any of them touched, writes all of them in one transaction, commits it and tells each. While it waits for the disk
 //! the next ones gather, so the more requests there are the fewer syncs each costs, and a lone one waits for nobody.
-//! Each write is undone alone when it fails. A transaction that fails as a whole is taken apart and tried one by one, so that
-//! everybody learns of their own failure and of no other.
+//! A transaction that fails, or in which one write refuses, is undone and taken apart: whoever refused is asked alone and the others
+//! together once more, and when that fails too, one by one. So everybody learns of their own failure and of no other, and what is
+//! rare costs those who meet it; savepoints would cost everybody.
 
 use std::collections::BTreeSet;
 use std::io;
+use std::panic::AssertUnwindSafe;
 use std::path::PathBuf;
 
+use futures_util::FutureExt;
 use futures_util::future::BoxFuture;
-use sqlx::{Connection, SqliteConnection};
+use sqlx::SqliteConnection;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 
@@ -110,60 +113,113 @@ impl GroupCommit {
 async fn commit_all(db: Db, mut requests: mpsc::UnboundedReceiver<Box<dyn Write>>) {
     let mut gathered = Vec::new();
     while requests.recv_many(&mut gathered, MAX_WRITES).await > 0 {
-        let (db, writes) = (db.clone(), std::mem::take(&mut gathered));
-        // In a task of its own: a panic ends these alone.
-        if let Err(panic) = tokio::spawn(async move { commit_together(&db, writes).await }).await {
-            tracing::error!(%panic, "writes ended in a panic");
+        let writes = std::mem::take(&mut gathered);
+        // A panic ends these alone; they are dropped with it, which tells whoever waits.
+        if AssertUnwindSafe(commit_together(&db, writes)).catch_unwind().await.is_err() {
+            tracing::error!("writes ended in a panic");
         }
     }
 }
 
 async fn commit_together(db: &Db, mut writes: Vec<Box<dyn Write>>) {
-    if writes.len() > 1 && attempt(db, &mut writes).await.is_ok() {
-        writes.into_iter().for_each(|write| write.answer(Ok(())));
-        return;
+    let mut alone = Vec::new();
+    // At most twice together: without those who refused the first time.
+    for _ in 0..2 {
+        if writes.len() < 2 {
+            break;
+        }
+        match attempt(db, &mut writes).await {
+            Ok(None) => {
+                writes.into_iter().for_each(|write| write.answer(Ok(())));
+                writes = Vec::new();
+            }
+            Ok(Some(refused)) => alone.push(writes.remove(refused)),
+            Err(_) => break,
+        }
     }
-    for write in writes {
+    alone.extend(writes);
+    for write in alone {
         let mut alone = [write];
-        let committed = attempt(db, &mut alone).await;
+        let committed = attempt(db, &mut alone).await.map(|_| ());
         let [write] = alone;
         write.answer(committed);
     }
 }
 
-/// Syncs the folders, runs the writes and commits those that want to be kept.
-async fn attempt(db: &Db, writes: &mut [Box<dyn Write>]) -> Result<(), StoreError> {
-    let folders: BTreeSet<PathBuf> = writes.iter().flat_map(|write| write.folders()).cloned().collect();
-    if !folders.is_empty() {
-        let _syncing = Syncing::folders(db.times());
-        // Side by side: the disk syncs several as fast as one.
-        let mut syncs = JoinSet::new();
-        for folder in folders {
-            syncs.spawn_blocking(move || atomic::sync_dir(&folder));
-        }
-        while let Some(synced) = syncs.join_next().await {
-            match synced.map_err(io::Error::other)? {
-                // Deleted meanwhile, with what the writes speak of: they will see.
-                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-                other => other?,
-            }
-        }
-    }
+/// Syncs the folders, runs the writes and commits them; gives the first that refused, because of which nothing is written.
+async fn attempt(db: &Db, writes: &mut [Box<dyn Write>]) -> Result<Option<usize>, StoreError> {
+    sync_folders(db, writes.iter().flat_map(|write| write.folders()).cloned().collect()).await?;
     let mut tx = db.write_untimed().await?;
-    let mut kept = false;
-    if let [alone] = writes {
-        kept = alone.run(&mut tx).await;
-    } else {
-        for write in writes {
-            let mut part = tx.begin().await?;
-            if write.run(&mut part).await {
-                part.commit().await?;
-                kept = true;
-            } else {
-                part.rollback().await?;
-            }
+    for (at, write) in writes.iter_mut().enumerate() {
+        if !write.run(&mut tx).await {
+            tx.rollback().await?;
+            return Ok(Some(at));
         }
     }
-    if kept { tx.commit().await? } else { tx.rollback().await? };
+    tx.commit().await?;
+    Ok(None)
+}
+
+async fn sync_folders(db: &Db, folders: BTreeSet<PathBuf>) -> Result<(), StoreError> {
+    if folders.is_empty() {
+        return Ok(());
+    }
+    let _syncing = Syncing::folders(db.times());
+    // Side by side: the disk syncs several as fast as one.
+    let mut syncs = JoinSet::new();
+    for folder in folders {
+        syncs.spawn_blocking(move || atomic::sync_dir(&folder));
+    }
+    while let Some(synced) = syncs.join_next().await {
+        match synced.map_err(io::Error::other)? {
+            // Deleted meanwhile, with what the writes speak of: they will see.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            other => other?,
+        }
+    }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    async fn write(group: &GroupCommit, name: &'static str, refuses: bool) -> Result<usize, StoreError> {
+        let written = group.commit(Vec::new(), move |tx| {
+            Box::pin(async move {
+                sqlx::query("INSERT INTO discards (folder) VALUES (?)").bind(name).execute(&mut *tx).await?;
+                if refuses { Err(StoreError::NotFound) } else { Ok(name.len()) }
+            })
+        });
+        written.await
+    }
+
+    #[tokio::test]
+    async fn writes_share_a_transaction_and_a_failure_is_of_its_own_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&folder.path().join("x.db")).await.unwrap();
+        let group = GroupCommit::start(&db);
+        // While somebody else writes, all of these gather.
+        let other = db.write().await.unwrap();
+        let all = async {
+            tokio::join!(
+                write(&group, "one", false),
+                write(&group, "refused", true),
+                write(&group, "two", false),
+                // SQLite itself refuses it.
+                write(&group, "two", false),
+                write(&group, "three", false),
+            )
+        };
+        let release = async {
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+            other.rollback().await.unwrap();
+        };
+        let (all, ()) = tokio::join!(all, release);
+        assert_eq!((all.0.unwrap(), all.2.unwrap(), all.4.unwrap()), (3, 3, 5));
+        assert!(matches!((all.1, all.3), (Err(StoreError::NotFound), Err(StoreError::Db(_)))));
+        let kept = super::super::db::discards::list(db.reader()).await.unwrap();
+        assert_eq!(kept, ["one", "three", "two"]);
+    }
 }

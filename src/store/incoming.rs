@@ -2,7 +2,7 @@
 //! hashed while it is written, and synced.
 
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 use tempfile::{NamedTempFile, TempPath};
@@ -26,7 +26,15 @@ pub struct StagedFile {
     pub size_bytes: u64,
     /// Of its bytes, in hexadecimal.
     pub sha256: String,
-    file: TempPath,
+    origin: Origin,
+}
+
+#[derive(Debug)]
+enum Origin {
+    /// A file that goes with this value.
+    Temporary(TempPath),
+    /// A file that keeps its name, and a folder of its file system for names on the way.
+    Kept { file: PathBuf, scratch: PathBuf },
 }
 
 impl StagedWriter {
@@ -62,7 +70,12 @@ impl StagedWriter {
     pub fn finish(self, path: ImagePath) -> io::Result<StagedFile> {
         self.file.as_file().sync_all()?;
         let sha256 = hex(&self.hash.finalize());
-        Ok(StagedFile { path, size_bytes: self.size_bytes, sha256, file: self.file.into_temp_path() })
+        Ok(StagedFile {
+            path,
+            size_bytes: self.size_bytes,
+            sha256,
+            origin: Origin::Temporary(self.file.into_temp_path()),
+        })
     }
 }
 
@@ -72,25 +85,17 @@ pub(super) fn hex(bytes: &[u8]) -> String {
 }
 
 impl StagedFile {
-    /// Stages a durable file of this file system under a second name; its first name stays.
-    ///
-    /// # Errors
-    /// What the system said.
-    pub(super) fn link(
-        file: &Path,
-        scratch: &Path,
-        path: ImagePath,
-        size_bytes: u64,
-        sha256: String,
-    ) -> io::Result<Self> {
-        let link = scratch.join(format!(".part-{}", Uuid::now_v7()));
-        std::fs::hard_link(file, &link)?;
-        Ok(Self { path, size_bytes, sha256, file: TempPath::try_from_path(link)? })
+    /// A durable file that gets a second name in the dataset; its first name stays. `scratch` lies on the same file system.
+    pub(super) fn kept(file: PathBuf, scratch: PathBuf, path: ImagePath, size_bytes: u64, sha256: String) -> Self {
+        Self { path, size_bytes, sha256, origin: Origin::Kept { file, scratch } }
     }
 
     /// Where its bytes lie now.
     pub fn staged_at(&self) -> &Path {
-        &self.file
+        match &self.origin {
+            Origin::Temporary(file) => file,
+            Origin::Kept { file, .. } => file,
+        }
     }
 
     /// Renames it, over what lies there.
@@ -98,6 +103,14 @@ impl StagedFile {
     /// # Errors
     /// What the system said.
     pub(super) fn move_to(self, target: &Path) -> io::Result<()> {
-        self.file.persist(target).map_err(|failed| failed.error)
+        let file = match self.origin {
+            Origin::Temporary(file) => file,
+            Origin::Kept { file, scratch } => {
+                let link = scratch.join(format!(".part-{}", Uuid::now_v7()));
+                std::fs::hard_link(file, &link)?;
+                TempPath::try_from_path(link)?
+            }
+        };
+        file.persist(target).map_err(|failed| failed.error)
     }
 }

@@ -38,7 +38,7 @@ pub use outputs::Checksums;
 pub use placing::Committed;
 pub(crate) use quota::check as check_quota;
 pub use quota::{Quantity, Quota};
-pub use resumable::{Appender, NewUpload, UploadError, UploadKind};
+pub use resumable::{Appended, Appender, NewUpload, UploadError, UploadKind};
 use space::Reservations;
 pub use token::{Scope, create_token, find_token};
 
@@ -125,7 +125,14 @@ impl Store {
         let data = DataDir::open(root)?;
         let db = Db::open(&data.database()).await?;
         let group = GroupCommit::start(&db);
-        Ok(Self { db, data, reservations: Reservations::default(), group, claims: Claims::default(), folders: Arc::default() })
+        Ok(Self {
+            db,
+            data,
+            reservations: Reservations::default(),
+            group,
+            claims: Claims::default(),
+            folders: Arc::default(),
+        })
     }
 
     /// Removes the folders of deleted jobs and datasets. What can't be removed stays on the list for the next time and is told to

@@ -13,9 +13,8 @@ use sqlx::SqliteConnection;
 use uuid::Uuid;
 
 use super::db::dataset_images::DatasetImageRow;
-use super::db::tokens::{self, Owned};
 use super::db::uploads::UploadRow;
-use super::db::{dataset_images, datasets, jobs, now_ms, uploads};
+use super::db::{dataset_images, datasets, now_ms, uploads};
 use super::{ImagePath, Quantity, StagedFile, Store, StoreError, check_quota};
 
 /// What became of a batch.
@@ -97,15 +96,14 @@ impl Store {
 
     async fn sort(&self, dataset: Uuid, files: Vec<StagedFile>) -> Result<Sorted, StoreError> {
         let mut reader = self.db.reader().acquire().await?;
-        check_writable(&mut reader, dataset).await?;
         let mut sorted = Sorted::default();
         let mut known = BTreeMap::<String, String>::new();
         for file in files {
             let path = file.path.as_str();
             if !known.contains_key(path)
-                && let Some(there) = dataset_images::find(&mut *reader, dataset, path).await?
+                && let Some(there) = find_place(&mut reader, dataset, path).await?.sha256
             {
-                known.insert(there.path, there.sha256);
+                known.insert(path.to_owned(), there);
             }
             match known.get(path) {
                 Some(there) if *there == file.sha256 => sorted.unchanged += 1,
@@ -154,7 +152,7 @@ impl Store {
     /// Removes files that got no row; gives the reason that counts.
     async fn withdraw(&self, dataset: Uuid, moved: Moved, error: StoreError) -> StoreError {
         // A folder that went with its dataset is no failure of the disk, and must not come back with a file in it.
-        let is_gone = matches!(datasets::exists(self.db.reader(), dataset).await, Ok(false));
+        let is_gone = matches!(datasets::in_use(self.db.reader(), dataset).await, Ok(None));
         let (data, folder) = (self.data.clone(), self.data.dataset(dataset));
         let removed = tokio::task::spawn_blocking(move || {
             if is_gone {
@@ -169,15 +167,25 @@ impl Store {
     }
 }
 
-/// Fails unless photographs may be added to a dataset now.
-pub(super) async fn check_writable(db: &mut SqliteConnection, dataset: Uuid) -> Result<(), StoreError> {
-    if !datasets::exists(&mut *db, dataset).await? {
-        return Err(StoreError::NotFound);
+/// A path of a dataset; fails unless photographs may be added there now.
+pub(super) async fn find_place(
+    db: &mut SqliteConnection,
+    dataset: Uuid,
+    path: &str,
+) -> Result<datasets::PlaceRow, StoreError> {
+    match datasets::place(db, dataset, path).await? {
+        None => Err(StoreError::NotFound),
+        Some(place) if place.in_use => Err(StoreError::DatasetInUse),
+        Some(place) => Ok(place),
     }
-    if jobs::use_of_dataset(db, dataset).await?.1 {
-        return Err(StoreError::DatasetInUse);
+}
+
+async fn check_writable(db: &mut SqliteConnection, dataset: Uuid) -> Result<(), StoreError> {
+    match datasets::in_use(db, dataset).await? {
+        None => Err(StoreError::NotFound),
+        Some(true) => Err(StoreError::DatasetInUse),
+        Some(false) => Ok(()),
     }
-    Ok(())
 }
 
 fn row(file: &StagedFile) -> DatasetImageRow {
@@ -205,8 +213,7 @@ async fn insert(
     for row in rows {
         dataset_images::insert(tx, dataset, row).await?;
     }
-    datasets::touch(tx, dataset, now_ms()).await?;
-    let owner = tokens::owner(&mut *tx, Owned::Dataset(dataset)).await?.flatten();
+    let owner = datasets::touch(tx, dataset, now_ms()).await?;
     check_quota(tx, owner.as_deref(), &[Quantity::Bytes, Quantity::Images]).await
 }
 

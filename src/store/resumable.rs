@@ -14,9 +14,9 @@ use sqlx::SqliteConnection;
 use uuid::Uuid;
 
 use super::db::uploads::UploadRow;
-use super::db::{dataset_images, now_ms, uploads};
+use super::db::{now_ms, uploads};
 use super::incoming::{StagedFile, hex};
-use super::placing::check_writable;
+use super::placing::find_place;
 use super::{ImagePath, Quantity, Store, StoreError, atomic, check_quota};
 
 /// Bytes copied at a time.
@@ -101,49 +101,64 @@ impl From<io::Error> for UploadError {
 /// Appends to the file of an upload. Blocking.
 pub struct Appender {
     file: File,
-    size_bytes: u64,
-    failure: Option<io::Error>,
+    appended: Appended,
+}
+
+/// What an [`Appender`] made durable.
+#[derive(Debug)]
+pub struct Appended {
+    /// The file's length.
+    pub size_bytes: u64,
+    /// Of its bytes, where the appender was given one of those before.
+    pub hash: Option<Sha256>,
+    /// What ended the writing.
+    pub failure: Option<io::Error>,
 }
 
 impl Appender {
     /// Takes bytes; after a failure it takes no more, and [`Self::finish`] tells.
     pub fn write(&mut self, bytes: &[u8]) -> bool {
+        let Appended { size_bytes, hash, failure } = &mut self.appended;
         let mut rest = bytes;
-        while self.failure.is_none() && !rest.is_empty() {
+        while failure.is_none() && !rest.is_empty() {
             match self.file.write(rest) {
-                Ok(0) => self.failure = Some(io::ErrorKind::WriteZero.into()),
+                Ok(0) => *failure = Some(io::ErrorKind::WriteZero.into()),
                 Ok(written) => {
-                    self.size_bytes += written as u64;
+                    if let Some(hash) = hash {
+                        hash.update(&rest[..written]);
+                    }
+                    *size_bytes += written as u64;
                     rest = &rest[written..];
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => self.failure = Some(error),
+                Err(error) => *failure = Some(error),
             }
         }
-        self.failure.is_none()
+        failure.is_none()
     }
 
-    /// Makes the bytes that were written durable; gives the file's length then, and the failure that ended the writing.
+    /// Makes the bytes that were written durable.
     ///
     /// # Errors
     /// When nothing can be said about what is durable.
-    pub fn finish(self) -> io::Result<(u64, Option<io::Error>)> {
+    pub fn finish(self) -> io::Result<Appended> {
         self.file.sync_data()?;
-        Ok((self.size_bytes, self.failure))
+        Ok(self.appended)
     }
 }
 
 impl Store {
-    /// Opens the file of an upload behind its first `offset` bytes; what lies there goes. Blocking.
+    /// Opens the file of an upload behind its first `offset` bytes, whose hash may be given to go on with it; what lies there goes.
+    /// Blocking.
     ///
     /// # Errors
     /// What the system said.
-    pub fn append_upload(&self, id: Uuid, offset: u64) -> io::Result<Appender> {
+    pub fn append_upload(&self, id: Uuid, offset: u64, hash: Option<Sha256>) -> io::Result<Appender> {
         let path = self.data.upload(id);
         let mut file = File::options().create(true).truncate(false).write(true).open(path)?;
         file.set_len(offset)?;
         file.seek(SeekFrom::Start(offset))?;
-        Ok(Appender { file, size_bytes: offset, failure: None })
+        Ok(Appender { file, appended: Appended { size_bytes: offset, hash, failure: None } })
     }
 
     /// Adds an upload without bytes.
@@ -225,12 +240,16 @@ impl Store {
         saved.await
     }
 
-    /// Puts a complete upload, whose bytes are durable, into its dataset and writes its row. Asking again is no error; for a partial or
-    /// incomplete one nothing happens.
+    /// Puts a complete upload, whose bytes are durable, into its dataset and writes its row. Where the caller does not know the SHA-256
+    /// of its bytes, they are read. Asking again is no error; for a partial or incomplete one nothing happens.
     ///
     /// # Errors
     /// [`UploadError::Conflict`], after which the upload is gone; a dataset that takes nothing now; what the store said.
-    pub async fn store_upload(self: &Arc<Self>, row: &mut UploadRow) -> Result<(), UploadError> {
+    pub async fn store_upload(
+        self: &Arc<Self>,
+        row: &mut UploadRow,
+        sha256: Option<[u8; 32]>,
+    ) -> Result<(), UploadError> {
         let (Some(dataset), Some(path)) = (&row.dataset_id, &row.path) else { return Ok(()) };
         if row.stored || row.length != Some(row.offset) {
             return Ok(());
@@ -238,9 +257,16 @@ impl Store {
         let dataset: Uuid = dataset.parse().map_err(|_| UploadError::NotFound)?;
         let path = ImagePath::parse(path).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))?;
         let id = upload_id(row)?;
-        let (file, scratch, size_bytes) = (self.data.upload(id), self.data.incoming(), to_u64(row.offset));
-        let staged = tokio::task::spawn_blocking(move || stage(&file, &scratch, path, size_bytes));
-        let staged = staged.await.map_err(io::Error::other)??;
+        let (file, size_bytes) = (self.data.upload(id), to_u64(row.offset));
+        let sha256 = match sha256 {
+            Some(sha256) => sha256,
+            None => {
+                let file = file.clone();
+                let hashing = tokio::task::spawn_blocking(move || hash_upload(&file, size_bytes));
+                hashing.await.map_err(io::Error::other)??
+            }
+        };
+        let staged = StagedFile::kept(file, self.data.incoming(), path, size_bytes, hex(&sha256));
         let stored = UploadRow { stored: true, ..row.clone() };
         match self.place_upload(dataset, staged, stored).await {
             Ok(()) => {}
@@ -252,7 +278,9 @@ impl Store {
             Err(error) => return Err(error.into()),
         }
         row.stored = true;
-        self.forget_file(id).await;
+        // Nobody need wait for that.
+        let store = Arc::clone(self);
+        tokio::spawn(async move { store.forget_file(id).await });
         Ok(())
     }
 
@@ -301,9 +329,8 @@ impl Store {
 
 async fn insert_upload(tx: &mut SqliteConnection, new: &NewUpload) -> Result<UploadRow, UploadError> {
     if let Some((dataset, path)) = &new.target {
-        check_writable(tx, *dataset).await?;
-        let there = dataset_images::find(&mut *tx, *dataset, path.as_str()).await?;
-        if there.is_some_and(|there| new.length.is_some_and(|length| i64::try_from(length) != Ok(there.size_bytes))) {
+        let stored_bytes = find_place(tx, *dataset, path.as_str()).await?.size_bytes;
+        if stored_bytes.zip(new.length).is_some_and(|(stored, length)| i64::try_from(length) != Ok(stored)) {
             return Err(UploadError::Conflict(path.to_string()));
         }
     }
@@ -339,8 +366,7 @@ fn to_u64(bytes: i64) -> u64 {
     u64::try_from(bytes).unwrap_or(0)
 }
 
-/// Hashes the file of a complete upload and gives it a second name for its way into the dataset.
-fn stage(file: &Path, scratch: &Path, path: ImagePath, size_bytes: u64) -> io::Result<StagedFile> {
+fn hash_upload(file: &Path, size_bytes: u64) -> io::Result<[u8; 32]> {
     let mut hash = Sha256::new();
     // An upload of nothing never had a file.
     let source = File::options().read(true).write(true).create(size_bytes == 0).truncate(false).open(file)?;
@@ -351,7 +377,7 @@ fn stage(file: &Path, scratch: &Path, path: ImagePath, size_bytes: u64) -> io::R
     if size_bytes == 0 {
         source.sync_all()?;
     }
-    StagedFile::link(file, scratch, path, size_bytes, hex(&hash.finalize()))
+    Ok(hash.finalize().into())
 }
 
 /// Feeds what is written into a hash.

@@ -110,7 +110,7 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
         // In a task of its own, so that a sender who leaves can't leave it half done.
         let joined = tokio::spawn(async move {
             let mut row = store.concatenate_uploads(new, parts, max_bytes).await?;
-            store.store_upload(&mut row).await?;
+            store.store_upload(&mut row, None).await?;
             Ok::<_, Problem>(row)
         });
         return Ok(created(&joined.await.map_err(|panic| Problem::internal(&panic))??, false));
@@ -144,7 +144,7 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
         }
     } else {
         // One of no bytes is complete at once.
-        state.jobs.store.store_upload(&mut row).await?;
+        state.jobs.store.store_upload(&mut row, None).await?;
     }
     Ok(created(&row, with_bytes))
 }
@@ -179,7 +179,7 @@ async fn show(State(state): State<AppState>, UploadId(id): UploadId) -> Result<R
     let _guard = take(&state, id).await?;
     let mut row = state.jobs.store.find_upload(id).await?;
     // Complete, but kept out of its dataset until now: a sender that sees all its bytes here asks no more.
-    state.jobs.store.store_upload(&mut row).await?;
+    state.jobs.store.store_upload(&mut row, None).await?;
     let mut response = StatusCode::OK.into_response();
     let headers = response.headers_mut();
     headers.insert(tus::UPLOAD_OFFSET, HeaderValue::from(row.offset));

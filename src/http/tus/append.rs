@@ -9,15 +9,16 @@ use std::time::{Duration, Instant};
 use axum::body::Body;
 use bytes::Bytes;
 use futures_util::StreamExt;
+use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 use tokio::task::{JoinHandle, spawn_blocking};
 use uuid::Uuid;
 
 use super::{Checksum, UploadGuard};
 use crate::http::problem::{Code, Problem};
-use crate::store::{Store, UploadError};
 use crate::store::db::now_ms;
 use crate::store::db::uploads::UploadRow;
+use crate::store::{Appended, Store, UploadError};
 
 /// Bytes after which what came so far is made durable.
 const SEGMENT_BYTES: u64 = 32 << 20;
@@ -26,8 +27,11 @@ const SEGMENT_BYTES: u64 = 32 << 20;
 const DRAIN_IDLE: Duration = Duration::from_millis(100);
 /// That other request waits no longer.
 const DRAIN_MOST: Duration = Duration::from_millis(500);
-/// Chunks on their way to the writer; a chunk is what one read of the connection brought.
-const QUEUED_CHUNKS: usize = 16;
+/// Chunks, each what one read of the connection brought, go to the writer in lots of so many bytes: to wake it costs more than to
+/// write a chunk.
+const LOT_BYTES: usize = 256 << 10;
+/// Lots on their way to the writer.
+const QUEUED_LOTS: usize = 3;
 
 /// One request that brings bytes.
 pub(in crate::http) struct Append {
@@ -55,8 +59,24 @@ enum End {
 }
 
 struct Segment {
-    sender: mpsc::Sender<Bytes>,
-    writing: JoinHandle<std::io::Result<(u64, Option<std::io::Error>)>>,
+    sender: mpsc::Sender<Vec<Bytes>>,
+    lot: Vec<Bytes>,
+    lot_bytes: usize,
+    writing: JoinHandle<std::io::Result<Appended>>,
+}
+
+impl Segment {
+    /// Takes bytes; false once the writer has ended.
+    async fn take(&mut self, bytes: Bytes) -> bool {
+        self.lot_bytes += bytes.len();
+        self.lot.push(bytes);
+        self.lot_bytes < LOT_BYTES || self.send().await
+    }
+
+    async fn send(&mut self) -> bool {
+        self.lot_bytes = 0;
+        self.sender.send(std::mem::take(&mut self.lot)).await.is_ok()
+    }
 }
 
 /// Takes the body in, counts what came, and puts a complete upload into its dataset; gives its row.
@@ -64,26 +84,30 @@ pub(in crate::http) async fn append(mut request: Append, body: Body) -> Result<(
     let before = request.row.clone();
     let taken = take_in(&mut request, body).await;
     let Append { store, row, .. } = &mut request;
-    if taken.is_ok() && row.length == Some(row.offset) && row.dataset_id.is_some() {
+    match taken {
         // Which counts the last bytes too, so that they wait for the disk once.
-        if let Err(error) = store.store_upload(row).await {
-            if !matches!(error, UploadError::Conflict(_)) {
-                store.save_upload(row, before.offset == 0).await?;
+        Ok(sha256) if row.length == Some(row.offset) && row.dataset_id.is_some() => {
+            if let Err(error) = store.store_upload(row, sha256).await {
+                if !matches!(error, UploadError::Conflict(_)) {
+                    store.save_upload(row, before.offset == 0).await?;
+                }
+                return Err(error.into());
             }
-            return Err(error.into());
         }
-    } else if *row != before {
-        store.save_upload(row, before.offset == 0).await?;
+        _ if *row != before => store.save_upload(row, before.offset == 0).await?,
+        _ => {}
     }
-    taken.map(|()| (request.row, request.guard))
+    taken.map(|_| (request.row, request.guard))
 }
 
-async fn take_in(request: &mut Append, body: Body) -> Result<(), Problem> {
+/// Takes the body in and notes in the row what is durable; gives the hash of the upload's bytes where all of them came just now.
+async fn take_in(request: &mut Append, body: Body) -> Result<Option<[u8; 32]>, Problem> {
     let start = u64::try_from(request.row.offset).unwrap_or(0);
     let end_bytes = request.row.length.and_then(|length| u64::try_from(length).ok()).unwrap_or(request.max_bytes);
     let mut body = body.into_data_stream();
     let mut arrived = start;
     let mut interrupted: Option<Instant> = None;
+    let mut hash = (start == 0).then(Sha256::new);
     let end = loop {
         let mut segment = None;
         let segment_start = arrived;
@@ -116,8 +140,8 @@ async fn take_in(request: &mut Append, body: Body) -> Result<(), Problem> {
             if let Some(checksum) = &mut request.checksum {
                 checksum.update(&bytes);
             }
-            let writer: &Segment = segment.get_or_insert_with(|| open(request, segment_start));
-            if writer.sender.send(bytes).await.is_err() {
+            let writer: &mut Segment = segment.get_or_insert_with(|| open(request, segment_start, hash.take()));
+            if !writer.take(bytes).await {
                 // The writer ended early: with an error, which the close below brings.
                 break None;
             }
@@ -126,7 +150,8 @@ async fn take_in(request: &mut Append, body: Body) -> Result<(), Problem> {
             }
         };
         if let Some(segment) = segment {
-            let (durable, failure) = close(segment).await?;
+            let Appended { size_bytes: durable, hash: so_far, failure } = close(segment).await?;
+            hash = so_far;
             // Bytes of a body that is too long, or under a checksum that has not spoken yet, do not count.
             if request.checksum.is_none() && !matches!(end, Some(End::TooLong)) {
                 count(request, durable);
@@ -157,7 +182,8 @@ async fn take_in(request: &mut Append, body: Body) -> Result<(), Problem> {
         (None, _) => {}
     }
     match end {
-        End::Complete => Ok(()),
+        // One of no bytes has no file yet, which whoever reads it makes.
+        End::Complete => Ok(hash.filter(|_| arrived > 0).map(|hash| hash.finalize().into())),
         End::Broken => Err(Problem::new(Code::BadRequest).detail("the body broke off; the bytes that came are kept")),
         End::Idle => {
             Err(Problem::new(Code::RequestTimeout).detail("no byte came for too long; those that came are kept"))
@@ -168,23 +194,25 @@ async fn take_in(request: &mut Append, body: Body) -> Result<(), Problem> {
     }
 }
 
-fn open(request: &Append, offset: u64) -> Segment {
-    let (sender, mut chunks) = mpsc::channel::<Bytes>(QUEUED_CHUNKS);
+fn open(request: &Append, offset: u64, hash: Option<Sha256>) -> Segment {
+    let (sender, mut lots) = mpsc::channel::<Vec<Bytes>>(QUEUED_LOTS);
     let (store, id) = (Arc::clone(&request.store), request.id);
     let writing = spawn_blocking(move || {
-        let mut file = store.append_upload(id, offset)?;
-        while let Some(chunk) = chunks.blocking_recv() {
-            if !file.write(&chunk) {
+        let mut file = store.append_upload(id, offset, hash)?;
+        while let Some(lot) = lots.blocking_recv() {
+            if !lot.iter().all(|chunk| file.write(chunk)) {
                 break;
             }
         }
         file.finish()
     });
-    Segment { sender, writing }
+    Segment { sender, lot: Vec::new(), lot_bytes: 0, writing }
 }
 
-/// Waits until a segment is durable; gives the upload's length then, and what ended the writing early.
-async fn close(segment: Segment) -> Result<(u64, Option<std::io::Error>), Problem> {
+/// Waits until a segment is durable.
+async fn close(mut segment: Segment) -> Result<Appended, Problem> {
+    // A writer that ended early says why below.
+    let _ = segment.send().await;
     drop(segment.sender);
     Ok(segment.writing.await.map_err(|panic| Problem::internal(&panic))??)
 }

@@ -55,11 +55,37 @@ pub async fn find(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<Option<
     .await
 }
 
-/// Whether there is such a dataset.
-pub async fn exists(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<bool> {
-    let found: Option<i64> =
-        sqlx::query_scalar("SELECT 1 FROM datasets WHERE id = ?").bind(id.to_string()).fetch_optional(db).await?;
-    Ok(found.is_some())
+/// Whether a job on a dataset is queued or running; none without such a dataset.
+pub async fn in_use(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<Option<bool>> {
+    sqlx::query_scalar(
+        "SELECT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id AND state IN ('queued', 'running')) FROM datasets d WHERE d.id = ?",
+    )
+    .bind(id.to_string())
+    .fetch_optional(db)
+    .await
+}
+
+/// What is known of a path before a photograph goes there.
+#[derive(Clone, Debug, PartialEq, Eq, FromRow)]
+pub struct PlaceRow {
+    /// Whether a job on the dataset is queued or running.
+    pub in_use: bool,
+    /// Of the bytes that are stored there, in hexadecimal.
+    pub sha256: Option<String>,
+    /// Their number.
+    pub size_bytes: Option<i64>,
+}
+
+/// A path of a dataset; none without such a dataset.
+pub async fn place(db: impl SqliteExecutor<'_>, id: Uuid, path: &str) -> sqlx::Result<Option<PlaceRow>> {
+    sqlx::query_as(
+        "SELECT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id AND state IN ('queued', 'running')) AS in_use, i.sha256, i.size_bytes
+         FROM datasets d LEFT JOIN dataset_images i ON i.dataset_id = d.id AND i.path = ? WHERE d.id = ?",
+    )
+    .bind(path)
+    .bind(id.to_string())
+    .fetch_optional(db)
+    .await
 }
 
 /// Datasets older than the one with `seq` `before`, newest first, of one token or of all. One whose upload is not complete yet is
@@ -84,14 +110,15 @@ pub async fn list(
     .await
 }
 
-/// Notes that photographs were added.
-pub async fn touch(db: &mut SqliteConnection, id: Uuid, now_ms: i64) -> sqlx::Result<()> {
-    sqlx::query("UPDATE datasets SET changed_ms = ? WHERE id = ?")
-        .bind(now_ms)
-        .bind(id.to_string())
-        .execute(db)
-        .await?;
-    Ok(())
+/// Notes that photographs were added; gives the token that the dataset belongs to.
+pub async fn touch(db: &mut SqliteConnection, id: Uuid, now_ms: i64) -> sqlx::Result<Option<String>> {
+    let owner: Option<Option<String>> =
+        sqlx::query_scalar("UPDATE datasets SET changed_ms = ? WHERE id = ? RETURNING owner_token")
+            .bind(now_ms)
+            .bind(id.to_string())
+            .fetch_optional(db)
+            .await?;
+    Ok(owner.flatten())
 }
 
 /// Removes a dataset with its image rows; whether it was there.

@@ -245,6 +245,9 @@ mod tests {
         figures.counts[1] = 98;
         figures.counts[5] = 1;
         figures.counts[CLASSES_MS.len()] = 1;
-        assert_eq!((figures.within_ms(0.98), figures.within_ms(0.99), figures.within_ms(1.0)), (Some(2), Some(50), None));
+        assert_eq!(
+            (figures.within_ms(0.98), figures.within_ms(0.99), figures.within_ms(1.0)),
+            (Some(2), Some(50), None)
+        );
     }
 }
