@@ -12,6 +12,10 @@ use crate::scene::{
     CameraId, DESCRIPTOR_LEN, Descriptor, Features, ImageId, Keypoint, KeypointIdx, Observation, Reconstruction,
 };
 
+/// A position undistorted again may differ from what was distorted by this, in units of the focal length, before it counts as
+/// folded back by the distortion.
+const MAX_FOLD: f64 = 1e-6;
+
 /// A scene ready to be photographed. Images may be taken in any order and in parallel: each depends on its number only.
 pub struct Photographer<'a> {
     options: &'a SceneOptions,
@@ -132,6 +136,12 @@ impl<'a> Photographer<'a> {
             let x_in_cam = pose.apply(&point.surface.xyz);
             let Some(exact) = camera.project(&x_in_cam) else { continue };
             if !(0.0..width).contains(&exact.0.x) || !(0.0..height).contains(&exact.0.y) {
+                continue;
+            }
+            // Far outside the field of view a distortion polynomial turns back and puts points into the picture that no lens
+            // shows there.
+            let seen_at = camera.unproject(&exact).0 - x_in_cam.xy() / x_in_cam.z;
+            if seen_at.norm() > MAX_FOLD {
                 continue;
             }
             let displacement = if gross {

@@ -221,6 +221,26 @@ mod tests {
     }
 
     #[test]
+    fn no_lens_shows_what_lies_beyond_its_field_of_view() {
+        // Along a street there are points at up to 75 degrees from the axis, which a barrel distortion folds into the image.
+        let options = SceneOptions {
+            layout: Layout::Street,
+            num_images: 60,
+            num_points: 6000,
+            camera_model: CameraModel::SimpleRadial,
+            ..SceneOptions::default()
+        };
+        let truth = generate(&options).truth;
+        assert!(truth.num_observations() > 10_000);
+        for (_, point) in truth.points() {
+            for seen in &point.track {
+                let x_in_cam = truth.images()[&seen.image].cam_from_world.apply(&point.xyz);
+                assert!(x_in_cam.xy().norm() < x_in_cam.z, "{x_in_cam}");
+            }
+        }
+    }
+
+    #[test]
     fn noise_and_outliers_are_as_asked() {
         let options = SceneOptions {
             pixel_noise_px: 0.5,
