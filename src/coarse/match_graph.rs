@@ -36,6 +36,11 @@ impl MatchGraph {
         Self { pairs: pairs.map(|(&key, geometry)| (key, geometry.clone())).collect() }
     }
 
+    /// Whether there are pairs, and each is explained by a homography: nothing but planes and turned cameras.
+    pub fn is_flat(&self) -> bool {
+        !self.pairs.is_empty() && self.pairs.values().all(|geometry| !geometry.config.has_epipolar_geometry())
+    }
+
     /// Number of verified pairs of every image.
     pub fn degrees(&self) -> BTreeMap<ImageId, usize> {
         let mut degrees = BTreeMap::new();

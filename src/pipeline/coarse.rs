@@ -142,6 +142,15 @@ pub fn run(
         if reached as f64 >= options.coarse.enough_registered * usable as f64 {
             break;
         }
+        if reached == 0 && before.graph.degrees().len() == usable && before.graph.is_flat() {
+            notes.push(
+                "All photographs match others, but as if the camera had only been turned: no two show depth. Where an object \
+                 was turned in front of a still background, mask the background (masks/<name>.png, 0 where a picture is to \
+                 be left out)."
+                    .to_owned(),
+            );
+            break;
+        }
         notes.push(format!(
             "The {:.0} % of the features of largest scale brought {reached} of {usable} photographs into the largest coarse \
              model{}.",

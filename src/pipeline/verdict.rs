@@ -121,7 +121,8 @@ fn reason(features: usize, why: &Unregistered, most_alike: Option<&str>) -> Reas
         Unregistered::NoInitialPair => Reason {
             code: "no_initial_pair",
             advice: "It matches other photographs, but no two of them were taken far enough apart to measure depth. \
-                     Take more photographs from different standpoints instead of turning on the spot."
+                     Take more photographs from different standpoints instead of turning on the spot. If an object was \
+                     turned in front of a still background, mask the background."
                 .to_owned(),
         },
         Unregistered::TooFewPoints { visible } => Reason {

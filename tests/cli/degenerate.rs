@@ -93,6 +93,31 @@ fn views_turned_on_the_spot_find_the_same_spot() {
     }
 }
 
+/// More features would show no other standpoint either, so no wider share of them is tried.
+#[test]
+fn pictures_from_one_spot_give_no_model_and_say_why() {
+    let folder = tempfile::tempdir().unwrap();
+    let (images, out) = (folder.path().join("images"), folder.path().join("out"));
+    std::fs::create_dir(&images).unwrap();
+    let source = image::open(photographs().join("temple_004.jpg")).unwrap().to_rgb8();
+    let (k, mut rng) = (calibration(FOCAL_PX), Rng::from_parts(&[3]));
+    for at in 0..6 {
+        let turn = Rotation3::from_euler_angles(0.02 * f64::from(at % 2), 0.04 * f64::from(at) - 0.1, 0.0);
+        let to_source = k * turn.matrix() * k.try_inverse().unwrap();
+        warped(&source, &to_source, &mut rng).save(images.join(format!("turned_{at}.png"))).unwrap();
+    }
+    let run = multistage(&["reconstruct", images.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    assert_eq!(run.status.code(), Some(3), "{}", String::from_utf8_lossy(&run.stderr));
+    let report: serde_json::Value = serde_json::from_reader(File::open(out.join("report.json")).unwrap()).unwrap();
+    let notes = report["notes"].to_string();
+    assert!(notes.contains("as if the camera had only been turned") && notes.contains("masks/"), "{notes}");
+    let matched = report["stages"].as_array().unwrap().iter().filter(|stage| stage["name"] == "coarse_match").count();
+    assert_eq!(matched, 1, "a wider share was tried");
+    for image in report["images"].as_array().unwrap() {
+        assert_eq!(image["reason"], "no_initial_pair", "{image}");
+    }
+}
+
 /// A picture hung on a wall and photographed from an arc, by pictures without EXIF.
 #[test]
 fn a_flat_scene_is_reconstructed() {
