@@ -1,7 +1,7 @@
 //! Feeds everything that reads bytes of others with mangled files: bytes changed, cut, doubled and put together from two.
 //!
 //! `MULTISTAGE_CORPUS=FOLDER cargo test --locked --test parsers corpus` feeds every file of a folder to every reader, such as what a
-//! fuzzer found (see `fuzz/README.md`).
+//! fuzzer found (see `fuzz/README.md`); with `MULTISTAGE_SEEDS=FOLDER` the whole files are written there, for a fuzzer to begin with.
 
 #![allow(clippy::unwrap_used)]
 
@@ -50,6 +50,19 @@ fn seeds() -> Vec<Vec<u8>> {
     write(&|out| bundler::write_bundle(&model, out).unwrap());
     write(&|out| out.extend(br#"{"intake": {"max_long_side_px": 1000}, "iterations": 1}"#));
     write(&|out| out.extend(b"https://user@[::ffff:7f00:1]:8080/a/../b?c#d"));
+    write(&|out| {
+        out.extend(
+            b"--X\r\nContent-Disposition: form-data; name=\"images\"; filename=\"a/\xc3\xbc.jpg\"\r\n\r\nbytes\r\n",
+        );
+        out.extend(
+            b"--X\r\nContent-Disposition: form-data; name=\"archive\"; filename*=UTF-8''b%2ezip\r\n\r\nPK\r\n--X--\r\n",
+        );
+    });
+    // The dataset `00000000-0000-0000-0000-000000000001`, the path `a.jpg`, and the SHA-1 of `hello`.
+    let metadata = "dataset MDAwMDAwMDAtMDAwMC0wMDAwLTAwMDAtMDAwMDAwMDAwMDAx,path YS5qcGc=";
+    let checksum = "sha1 qvTGHdzF6KLavt4PO0gs2a6pQ00=";
+    write(&|out| out.extend(format!("5\n{metadata}\n\n\n{checksum}\n0\nhello").bytes()));
+    write(&|out| out.extend(b"3\n\npartial\n1\n\n0\nabc"));
     seeds
 }
 
@@ -100,8 +113,12 @@ thread_local! {
 
 #[test]
 fn every_seed_is_read_by_somebody_and_nobody_fails_on_others() {
-    for seed in seeds() {
+    let folder = std::env::var("MULTISTAGE_SEEDS");
+    for (n, seed) in seeds().into_iter().enumerate() {
         assert!(!seed.is_empty());
+        if let Ok(folder) = &folder {
+            std::fs::write(format!("{folder}/{n}"), &seed).unwrap();
+        }
         for (_, parse) in PARSERS {
             parse(&seed);
         }

@@ -1,6 +1,9 @@
 //! Everything that reads bytes of others, one function each, which may refuse but neither panic nor run away. The tests feed them
 //! mangled files, the fuzzers in `fuzz/` whatever they think of.
 
+#[path = "requests.rs"]
+mod requests;
+
 use std::io::{BufReader, Write};
 
 use multistage::config::IpNetwork;
@@ -15,7 +18,7 @@ use multistage::store::{ArchiveLimits, ImagePath, unpack};
 pub type Parser = (&'static str, fn(&[u8]));
 
 /// Every reader.
-pub const PARSERS: [Parser; 10] = [
+pub const PARSERS: [Parser; 12] = [
     ("photograph", photograph),
     ("exif", exif),
     ("archive", archive),
@@ -26,6 +29,8 @@ pub const PARSERS: [Parser; 10] = [
     ("pose_lists", pose_lists),
     ("options", options),
     ("names", names),
+    ("form", requests::form),
+    ("tus_headers", requests::tus_headers),
 ];
 
 fn photograph(bytes: &[u8]) {
