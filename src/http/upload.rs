@@ -23,7 +23,7 @@ use super::disposition::file_name;
 use super::problem::{Code, Problem};
 use super::unread::Unread;
 use crate::config::UploadLimits;
-use crate::store::{ArchiveError, Committed, ImagePath, StagedFile, StagedWriter, Store, unpack};
+use crate::store::{ArchiveError, Committed, ImagePath, ScratchDir, StagedFile, StagedWriter, Store, unpack};
 
 /// Files synced side by side and committed at once.
 const BATCH_FILES: usize = 32;
@@ -97,7 +97,7 @@ struct Intake {
     limits: UploadLimits,
     idle: Duration,
     /// For files on their way; goes with all it holds when the request ends.
-    scratch: tempfile::TempDir,
+    scratch: ScratchDir,
     received: Received,
     bytes: u64,
     files: usize,
@@ -162,13 +162,12 @@ pub(super) async fn receive(state: &AppState, parts: Parts, dataset: Uuid, form:
 }
 
 async fn receive_parts(state: &AppState, mut parts: Parts, dataset: Uuid, form: Form) -> Result<Received, Problem> {
-    let incoming = state.jobs.store.data.incoming();
     let mut intake = Intake {
         store: Arc::clone(&state.jobs.store),
         dataset,
         limits: state.config.uploads,
         idle: state.config.upload_idle_timeout,
-        scratch: tempfile::tempdir_in(incoming)?,
+        scratch: state.jobs.store.data.scratch()?,
         received: Received::default(),
         bytes: 0,
         files: 0,

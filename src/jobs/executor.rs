@@ -279,7 +279,12 @@ impl Executor {
             Ok(finished) => finished,
             Err(error) => {
                 let message = format!("the job could not be started: {error}");
-                return Outcome::Failed(ErrorView { stage: None, code: "io_error".to_owned(), message });
+                let code = match &error {
+                    full if full.is_disk_full() => "disk_full",
+                    broken if broken.is_disk_error() => "disk_error",
+                    _ => "io_error",
+                };
+                return Outcome::Failed(ErrorView { stage: None, code: code.to_owned(), message });
             }
         };
         let mut recorder = Recorder::new(id);

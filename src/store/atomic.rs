@@ -3,16 +3,18 @@
 //! A file is written under a temporary name, synced, renamed to its final name, and its folder synced: after a crash or a
 //! power cut at any moment the name stands for the old bytes, the new bytes or nothing.
 
-use std::fs::{File, Permissions};
+use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
 use tempfile::NamedTempFile;
 
 /// A new temporary file in `folder`, readable by others once it is renamed; deleted when dropped.
 pub(crate) fn temporary_in(folder: &Path) -> io::Result<NamedTempFile> {
-    tempfile::Builder::new().prefix(".part-").permissions(Permissions::from_mode(0o644)).tempfile_in(folder)
+    // Opened here, so that an error is the system's own: the crate's hides its number.
+    let open = |path: &Path| OpenOptions::new().read(true).write(true).create_new(true).mode(0o644).open(path);
+    tempfile::Builder::new().prefix(".part-").make_in(folder, open)
 }
 
 /// Writes `parts`, one after the other, to the file `path`; the temporary file is made in `scratch` (same file system).

@@ -32,6 +32,25 @@ pub struct DataDir {
     _lock: Arc<File>,
 }
 
+/// A folder for what is on its way in; goes with all it holds when dropped.
+#[derive(Debug)]
+pub struct ScratchDir(PathBuf);
+
+impl ScratchDir {
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+impl Drop for ScratchDir {
+    fn drop(&mut self) {
+        if let Err(error) = std::fs::remove_dir_all(&self.0) {
+            tracing::warn!(folder = %self.0.display(), %error, "an upload's folder stays until the next start");
+        }
+    }
+}
+
 impl DataDir {
     /// Makes the directory where needed and locks it.
     ///
@@ -117,6 +136,16 @@ impl DataDir {
 
     pub(crate) fn incoming(&self) -> PathBuf {
         self.root.join("incoming")
+    }
+
+    /// A new folder for what is on its way in.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub fn scratch(&self) -> io::Result<ScratchDir> {
+        let folder = self.incoming().join(Uuid::now_v7().to_string());
+        std::fs::create_dir(&folder)?;
+        Ok(ScratchDir(folder))
     }
 
     /// What the files below a folder take; a missing one takes nothing.

@@ -33,7 +33,7 @@ pub use file_name::{ImagePath, InvalidFileName};
 use folders::DurableFolders;
 use group_commit::GroupCommit;
 pub use incoming::{StagedFile, StagedWriter};
-pub use layout::DataDir;
+pub use layout::{DataDir, ScratchDir};
 pub use outputs::Checksums;
 pub use placing::Committed;
 pub(crate) use quota::check as check_quota;

@@ -12,8 +12,8 @@ use serde_json::{Value, json};
 use crate::service::{file, jpeg};
 
 /// Writes that are made to fail in an ordinary run: every so many up to the last of a round, as a rule.
-const STEP: i64 = 13;
-const LAST: i64 = 210;
+const STEP: i64 = 17;
+const LAST: i64 = 290;
 const ENOSPC: i64 = 28;
 const EIO: i64 = 5;
 /// Calls that fail in a row.
