@@ -14,6 +14,17 @@ if ! command -v chromium >/dev/null && ! command -v chromium-browser >/dev/null 
   fi
 fi
 
+# Records what the program does to files, for the test of power cuts.
+if ! command -v strace >/dev/null; then
+  if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+    echo "setup: installing strace"
+    { apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -y -q strace; } >/dev/null 2>&1 ||
+      echo "setup: strace could not be installed; the test of power cuts will be skipped"
+  else
+    echo "setup: no strace; install the Debian package 'strace' to run the test of power cuts"
+  fi
+fi
+
 # pycolmap reads our COLMAP files, and the other packages talk to our service, independently of our code.
 if ! cmp -s tests/requirements.txt .venv/ready; then
   if command -v python3 >/dev/null; then

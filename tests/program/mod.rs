@@ -27,7 +27,12 @@ impl Program {
 
     /// The same, with its log to there.
     pub fn start_logging(data_dir: &Path, arguments: &[&str], log: impl Into<Stdio>) -> Self {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_multistage"))
+        Self::start_as(Command::new(env!("CARGO_BIN_EXE_multistage")), data_dir, arguments, log)
+    }
+
+    /// The same by another command, which ends with the program's name.
+    pub fn start_as(mut command: Command, data_dir: &Path, arguments: &[&str], log: impl Into<Stdio>) -> Self {
+        let mut child = command
             .args(["serve", "--bind", "127.0.0.1:0", "--threads", "2", "--data-dir"])
             .arg(data_dir)
             .args(arguments)
@@ -57,6 +62,11 @@ impl Program {
     /// The process.
     pub fn id(&self) -> u32 {
         self.child.id()
+    }
+
+    /// Waits until it has ended.
+    pub fn wait(&mut self) {
+        self.child.wait().unwrap();
     }
 
     /// As `kill -9`: no time for anything.
