@@ -208,7 +208,7 @@ async fn record() -> Option<Recorded> {
     let strace = program.id();
     let children = std::fs::read_to_string(format!("/proc/{strace}/task/{strace}/children")).unwrap();
     assert!(Command::new("kill").arg("-9").args(children.split_whitespace()).status().unwrap().success());
-    program.wait();
+    program.wait_for_end();
     let lines = parse(&String::from_utf8_lossy(&std::fs::read(record).unwrap()));
     let mut sent = BTreeMap::new();
     for (at, line) in lines.iter().enumerate().filter(|(_, line)| line.is_sent()) {

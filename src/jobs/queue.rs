@@ -143,7 +143,8 @@ pub(super) async fn transition(
     error: Option<ErrorView>,
 ) -> Result<(), StoreError> {
     let id = job_id(row)?;
-    let now = now_ms();
+    // Somebody may have set the clock back between two starts of the program; nothing happens to a job before what happened last.
+    let now = now_ms().max(row.created_ms).max(row.started_ms.unwrap_or(0));
     debug_assert!(state_of(row).may_become(next), "{} -> {next}", row.state);
     row.state = next.as_str().to_owned();
     if next == JobState::Running {

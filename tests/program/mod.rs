@@ -65,7 +65,7 @@ impl Program {
     }
 
     /// Waits until it has ended.
-    pub fn wait(&mut self) {
+    pub fn wait_for_end(&mut self) {
         self.child.wait().unwrap();
     }
 
