@@ -122,7 +122,8 @@ async fn commit_all(db: Db, mut requests: mpsc::UnboundedReceiver<Box<dyn Write>
 }
 
 async fn commit_together(db: &Db, mut writes: Vec<Box<dyn Write>>) {
-    let mut alone = Vec::new();
+    // Who refused, with their places among the others.
+    let mut refused: Vec<(usize, Box<dyn Write>)> = Vec::new();
     // At most twice together: without those who refused the first time.
     for _ in 0..2 {
         if writes.len() < 2 {
@@ -133,12 +134,17 @@ async fn commit_together(db: &Db, mut writes: Vec<Box<dyn Write>>) {
                 writes.into_iter().for_each(|write| write.answer(Ok(())));
                 writes = Vec::new();
             }
-            Ok(Some(refused)) => alone.push(writes.remove(refused)),
+            Ok(Some(at)) => refused.push((at, writes.remove(at))),
             Err(_) => break,
         }
     }
-    alone.extend(writes);
-    for write in alone {
+    if !writes.is_empty() {
+        // Whoever refuses because of an earlier write must still come after it: the last taken out is put back first.
+        while let Some((at, write)) = refused.pop() {
+            writes.insert(at, write);
+        }
+    }
+    for write in refused.into_iter().map(|(_, write)| write).chain(writes) {
         let mut alone = [write];
         let committed = attempt(db, &mut alone).await.map(|_| ());
         let [write] = alone;
