@@ -453,7 +453,16 @@ impl Jobs {
         remove_job(&mut tx, id).await?;
         tx.commit().await?;
         self.hub.announce();
-        Ok(self.store.discard_deleted().await?)
+        self.remove_folders().await;
+        Ok(())
+    }
+
+    /// Removes the folders of what was deleted. The deletion itself is done and must not be told as failed: what stays stands on the
+    /// list, for the next deletion or start.
+    async fn remove_folders(&self) {
+        if let Err(error) = self.store.discard_deleted().await {
+            tracing::warn!(%error, "folders of what was deleted stay until the next deletion");
+        }
     }
 
     /// Deletes a dataset that no job refers to.
@@ -476,6 +485,7 @@ impl Jobs {
             return Err(JobsError::DatasetNotFound);
         }
         tx.commit().await?;
-        Ok(self.store.discard_deleted().await?)
+        self.remove_folders().await;
+        Ok(())
     }
 }
