@@ -4,6 +4,7 @@
 //! puts it in order ([`recover`]); between them goes nothing but wake-ups ([`Hub`]).
 
 mod again;
+mod deletion;
 mod engine;
 mod eta;
 mod executor;

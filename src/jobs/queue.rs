@@ -1,5 +1,5 @@
-//! What may be done with jobs from outside: enqueue, cancel, resume, delete. Every move is one transaction, and each change of
-//! state is an event.
+//! What may be done with jobs from outside: enqueue, cancel, resume (and delete: [`super::deletion`]). Every move is one
+//! transaction, and each change of state is an event.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -193,20 +193,6 @@ async fn ordered_queue(db: &mut SqliteConnection) -> Result<Vec<Waiting>, StoreE
     Ok(schedule::order(waiting, &turns.collect()))
 }
 
-/// Removes the rows of a job that does not run, and its dataset when its own upload made it and no other job uses it; gives that
-/// dataset.
-pub(super) async fn remove_job(tx: &mut SqliteConnection, id: Uuid) -> Result<Option<Uuid>, StoreError> {
-    let own: Option<Uuid> = datasets::owned_only_by(&mut *tx, id).await?.and_then(|dataset| dataset.parse().ok());
-    jobs::delete(&mut *tx, id).await?;
-    match own {
-        Some(dataset) => {
-            datasets::delete(tx, dataset).await?;
-        }
-        None => datasets::release_owner(tx, id).await?,
-    }
-    Ok(own)
-}
-
 /// Puts a job that is over into the queue once more, on the photographs that its dataset holds now; what it made is forgotten.
 pub(super) async fn queue_again(tx: &mut SqliteConnection, row: &mut JobRow) -> Result<(), JobsError> {
     let id = job_id(row)?;
@@ -325,7 +311,7 @@ impl Jobs {
 
     /// Whether something that makes room may be tried once more: the disk is so full that not even that could be written down, and
     /// the ballast was there to be given up.
-    fn made_room(&self, error: &JobsError) -> bool {
+    pub(super) fn made_room(&self, error: &JobsError) -> bool {
         matches!(error, JobsError::Store(error) if error.is_disk_full()) && self.store.drop_ballast()
     }
 
@@ -431,61 +417,5 @@ impl Jobs {
         self.hub.announce();
         self.hub.wake_executor();
         Ok(row)
-    }
-
-    /// Deletes a job that does not run, its files, and its dataset when its own upload made it and no other job uses it.
-    ///
-    /// # Errors
-    /// [`JobsError::Running`].
-    pub async fn delete(&self, id: Uuid) -> Result<(), JobsError> {
-        match self.try_delete(id).await {
-            Err(error) if self.made_room(&error) => self.try_delete(id).await,
-            other => other,
-        }
-    }
-
-    async fn try_delete(&self, id: Uuid) -> Result<(), JobsError> {
-        let mut tx = self.store.db.write().await?;
-        let row = jobs::find(&mut *tx, id).await?.ok_or(JobsError::JobNotFound)?;
-        if state_of(&row) == JobState::Running {
-            return Err(JobsError::Running);
-        }
-        remove_job(&mut tx, id).await?;
-        tx.commit().await?;
-        self.hub.announce();
-        self.remove_folders().await;
-        Ok(())
-    }
-
-    /// Removes the folders of what was deleted. The deletion itself is done and must not be told as failed: what stays stands on the
-    /// list, for the next deletion or start.
-    async fn remove_folders(&self) {
-        if let Err(error) = self.store.discard_deleted().await {
-            tracing::warn!(%error, "folders of what was deleted stay until the next deletion");
-        }
-    }
-
-    /// Deletes a dataset that no job refers to.
-    ///
-    /// # Errors
-    /// [`StoreError::DatasetInUse`].
-    pub async fn delete_dataset(&self, id: Uuid) -> Result<(), JobsError> {
-        match self.try_delete_dataset(id).await {
-            Err(error) if self.made_room(&error) => self.try_delete_dataset(id).await,
-            other => other,
-        }
-    }
-
-    async fn try_delete_dataset(&self, id: Uuid) -> Result<(), JobsError> {
-        let mut tx = self.store.db.write().await?;
-        if jobs::use_of_dataset(&mut tx, id).await?.0 {
-            return Err(StoreError::DatasetInUse.into());
-        }
-        if !datasets::delete(&mut tx, id).await? {
-            return Err(JobsError::DatasetNotFound);
-        }
-        tx.commit().await?;
-        self.remove_folders().await;
-        Ok(())
     }
 }

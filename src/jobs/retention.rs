@@ -5,7 +5,7 @@ use std::time::Duration;
 use sqlx::SqliteConnection;
 use uuid::Uuid;
 
-use super::queue::remove_job;
+use super::deletion::remove_job;
 use crate::store::StoreError;
 use crate::store::db::{Db, datasets, jobs, now_ms};
 

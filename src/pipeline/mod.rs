@@ -2,6 +2,7 @@
 
 mod add_points;
 mod coarse;
+mod coarse_match;
 mod colors;
 mod context;
 mod error;
