@@ -191,12 +191,14 @@ async fn the_program_killed_again_and_again_makes_the_same_model() {
     // Right after the acknowledgement.
     program.kill();
     let mut kills = 1;
-    for stage in ["features", "coarse_match", "coarse_model", "add_cameras", "add_points", "refine", "export"] {
+    let stages = ["features", "coarse_match", "coarse_model", "add_cameras", "add_points", "refine", "export"];
+    for at in 0..stages.len() {
         let start = Instant::now();
         let program = Program::start(folder.path());
         let ready = reqwest::get(format!("{}/readyz", program.base)).await.unwrap();
         assert!(ready.status().is_success() && start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
-        let job = program.wait(&link, |job| job["stage"]["name"] == stage).await;
+        // A short stage may be over before anybody looks; the next one does as well.
+        let job = program.wait(&link, |job| stages[at..].iter().any(|stage| job["stage"]["name"] == *stage)).await;
         if job["state"] == "running" {
             kills += 1;
         }

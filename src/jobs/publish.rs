@@ -37,6 +37,8 @@ pub(super) fn publish(data: &DataDir, job: Uuid) -> io::Result<Vec<JobOutputRow>
         std::fs::rename(&partial, &out)?;
     }
     atomic::sync_parent(&out)?;
+    // The job's own folder is as new as what is in it.
+    atomic::sync_parent(out.parent().unwrap_or(&out))?;
     Ok(outputs)
 }
 
