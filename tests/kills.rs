@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
+use multistage::math::Rng;
 use program::Program;
 use reqwest::{Response, StatusCode};
 use serde_json::{Value, json};
@@ -244,15 +245,6 @@ fn photographs() -> Option<Vec<(String, Vec<u8>)>> {
 }
 
 /// A generator of delays, seeded, so that a failure can be tried again.
-struct Random(u64);
-
-impl Random {
-    fn unit(&mut self) -> f64 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 33) as f64 / f64::from(1u32 << 31)
-    }
-}
-
 async fn integrity(data_dir: &Path) {
     let url = format!("sqlite://{}", data_dir.join("multistage.db").display());
     let pool = sqlx::SqlitePool::connect(&url).await.unwrap();
@@ -277,7 +269,7 @@ async fn nothing_acknowledged_is_lost_however_often_the_program_is_killed() {
     drop(program);
 
     let folder = tempfile::tempdir().unwrap();
-    let mut random = Random(7);
+    let mut random = Rng::from_parts(&[7]);
     let (mut killed, mut rounds, mut lives) = (0, 0, 0);
     let mut tally: BTreeMap<String, usize> = BTreeMap::new();
     while killed < kills {
@@ -286,11 +278,11 @@ async fn nothing_acknowledged_is_lost_however_often_the_program_is_killed() {
         loop {
             let program = start(folder.path()).await;
             // Most moments are drawn from short lives: requests take milliseconds, stages seconds.
-            let life = LIFE[0] + (LIFE[1] - LIFE[0]).mul_f64(random.unit().powi(2) * stretch);
+            let life = LIFE[0] + (LIFE[1] - LIFE[0]).mul_f64(random.uniform().powi(2) * stretch);
             let (base, mut phase) = (program.base.clone(), client.phase.subscribe());
             lives += 1;
             let target = (lives % 2 == 0).then_some(TARGETS[lives / 2 % TARGETS.len()]);
-            let pause = WITHIN.mul_f64(random.unit());
+            let pause = WITHIN.mul_f64(random.uniform());
             let end = async {
                 match target {
                     // The client holds the other end as long as this is waited for.

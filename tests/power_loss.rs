@@ -19,6 +19,7 @@ use std::time::Duration;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use futures_util::StreamExt;
+use multistage::math::Rng;
 use power_loss::record::{CALLS, Disk, Line, parse};
 use program::Program;
 use reqwest::{Client, RequestBuilder, Response};
@@ -172,15 +173,6 @@ async fn broken(base: &str, data_dir: &Path, promise: &Promise) -> Option<String
     })
 }
 
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, end: usize) -> usize {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 33) as usize % end
-    }
-}
-
 /// The program's work, recorded.
 struct Recorded {
     root: PathBuf,
@@ -268,7 +260,7 @@ async fn what_was_acknowledged_survives_power_cuts() {
     };
     let cuts = std::env::var("MULTISTAGE_POWER_CUTS").ok().and_then(|cuts| cuts.parse().ok()).unwrap_or(CUTS);
     let answers: Vec<usize> = recorded.promises.0.iter().map(|(id, _)| recorded.sent[id]).collect();
-    let mut random = Random(11);
+    let mut random = Rng::from_parts(&[11]);
     let mut most = 0;
     for cut in 0..cuts {
         // Right after an answer, or anywhere; and what was not synced is lost, or half of it.

@@ -12,6 +12,7 @@ use std::io::{Cursor, Write};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use futures_util::StreamExt;
+use multistage::math::Rng;
 use program::Program;
 use serde_json::{Value, json};
 use sha2::Digest;
@@ -26,22 +27,6 @@ const TIMES: usize = 3;
 const DROPPED_PERCENT: usize = 30;
 /// Requests at once.
 const AT_ONCE: usize = 6;
-
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, end: usize) -> usize {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 33) as usize % end
-    }
-
-    fn shuffled<T>(&mut self, mut list: Vec<T>) -> Vec<T> {
-        for at in (1..list.len()).rev() {
-            list.swap(at, self.below(at + 1));
-        }
-        list
-    }
-}
 
 /// How photographs travel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -139,7 +124,7 @@ async fn photographs_that_are_sent_again_and_again_are_stored_once() {
     let program = Program::start(folder.path());
     let address = program.base.strip_prefix("http://").unwrap();
     let http = reqwest::Client::new();
-    let mut random = Random(3);
+    let mut random = Rng::from_parts(&[3]);
     for way in [Way::Tus, Way::TusInTwo, Way::Form, Way::Archive] {
         let set: Set = (0..FILES)
             .map(|number| {
@@ -153,11 +138,9 @@ async fn photographs_that_are_sent_again_and_again_are_stored_once() {
         let mut acknowledged = [0; FILES];
         let (mut sent, mut dropped) = (0, 0);
         while !open.is_empty() {
-            let sends: Vec<_> = random
-                .shuffled(open)
-                .into_iter()
-                .map(|number| (number, [0; 2].map(|_| random.below(100) < DROPPED_PERCENT)))
-                .collect();
+            random.shuffle(&mut open);
+            let sends: Vec<_> =
+                open.into_iter().map(|number| (number, [0; 2].map(|_| random.below(100) < DROPPED_PERCENT))).collect();
             sent += sends.len();
             let (dataset, set) = (&dataset, &set);
             let sends = futures_util::stream::iter(sends).map(|(number, drops)| async move {

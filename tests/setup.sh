@@ -3,26 +3,25 @@
 # themselves as skipped.
 cd "$(dirname "$0")/.." || exit 1
 
+# Installs a Debian package where that may be done; says else what will go without it.
+install() {
+  if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+    echo "setup: installing $1"
+    { apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -y -q "$1"; } >/dev/null 2>&1 ||
+      echo "setup: $1 could not be installed; $2 will be skipped"
+  else
+    echo "setup: no $1; install the Debian package '$1' to run $2"
+  fi
+}
+
 # A browser for the page's tests.
 if ! command -v chromium >/dev/null && ! command -v chromium-browser >/dev/null && ! command -v google-chrome >/dev/null; then
-  if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
-    echo "setup: installing chromium"
-    { apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -y -q chromium; } >/dev/null 2>&1 ||
-      echo "setup: chromium could not be installed; the browser tests will be skipped"
-  else
-    echo "setup: no chromium; install the Debian package 'chromium' to run the browser tests"
-  fi
+  install chromium "the browser tests"
 fi
 
 # Records what the program does to files, for the test of power cuts.
 if ! command -v strace >/dev/null; then
-  if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
-    echo "setup: installing strace"
-    { apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -y -q strace; } >/dev/null 2>&1 ||
-      echo "setup: strace could not be installed; the test of power cuts will be skipped"
-  else
-    echo "setup: no strace; install the Debian package 'strace' to run the test of power cuts"
-  fi
+  install strace "the test of power cuts"
 fi
 
 # pycolmap reads our COLMAP files, and the other packages talk to our service, independently of our code.

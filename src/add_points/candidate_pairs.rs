@@ -11,7 +11,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use rayon::prelude::*;
-
 use serde::{Deserialize, Serialize};
 
 use super::options::CandidatePairOptions;

@@ -37,9 +37,7 @@ mod tests;
 pub mod triangulate;
 pub mod views;
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
@@ -108,36 +106,8 @@ pub struct AddPointsReport {
 
 /// Loads an image's features.
 pub type LoadFeatures<'a> = dyn Fn(ImageId) -> Arc<Features> + Sync + 'a;
-/// Hears of units done and of all units.
-pub type Progress<'a> = dyn Fn(usize, usize) + Sync + 'a;
 /// Whether somebody asked to stop.
 pub type Cancelled<'a> = dyn Fn() -> bool + Sync + 'a;
-
-/// The whole stage: chooses pairs, matches them, and adds what they show to the model. With `new_images`, only pairs with
-/// one of them are matched (the paper's later iterations).
-///
-/// # Errors
-/// When cancelled (the model is then unchanged), or when features are not those of the model's keypoints.
-pub fn add_points(
-    model: &mut Reconstruction,
-    features: &LoadFeatures,
-    new_images: Option<&BTreeSet<ImageId>>,
-    options: &AddPointsOptions,
-    seed: u64,
-    progress: &Progress,
-    cancelled: &Cancelled,
-) -> Result<AddPointsReport, AddPointsError> {
-    let pairs = candidate_pairs(model, new_images, &options.candidate_pairs);
-    let done = AtomicUsize::new(0);
-    let one_more = || progress(done.fetch_add(1, Ordering::Relaxed) + 1, pairs.len());
-    let mut matcher = PairMatcher::new(model, features, options, seed);
-    let mut matches = Vec::with_capacity(pairs.len());
-    for tile in tiles(model, &pairs, &options.blocks) {
-        matcher.prepare(&tile, cancelled)?;
-        matches.extend(matcher.match_pairs(&tile, &one_more, cancelled)?);
-    }
-    add_matches(model, matches, options, cancelled)
-}
 
 /// Brings the matches of all pairs into the model: tracks per image, triangulation, merging (6.3). The order of the pairs does
 /// not show.

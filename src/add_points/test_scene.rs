@@ -1,10 +1,15 @@
 //! A small scene with known truth for this stage's tests: cameras in an arc before a wall in relief.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nalgebra::{UnitQuaternion, Vector3};
 
+use super::{
+    AddPointsError, AddPointsOptions, AddPointsReport, Cancelled, LoadFeatures, PairMatcher, add_matches,
+    candidate_pairs, tiles,
+};
 use crate::camera::{Camera, CameraModel, FocalSource, Pixel};
 use crate::geometry::Rigid3;
 use crate::math::Rng;
@@ -178,4 +183,30 @@ impl TestScene {
         let in_b: std::collections::BTreeSet<usize> = self.truth[b].iter().flatten().copied().collect();
         self.truth[a].iter().flatten().filter(|point| in_b.contains(point)).count()
     }
+}
+
+/// The whole stage: chooses pairs, matches them, and adds what they show to the model. With `new_images`, only pairs with
+/// one of them are matched (the paper's later iterations).
+///
+/// # Errors
+/// When cancelled (the model is then unchanged), or when features are not those of the model's keypoints.
+pub fn add_points(
+    model: &mut Reconstruction,
+    features: &LoadFeatures,
+    new_images: Option<&BTreeSet<ImageId>>,
+    options: &AddPointsOptions,
+    seed: u64,
+    progress: &(dyn Fn(usize, usize) + Sync),
+    cancelled: &Cancelled,
+) -> Result<AddPointsReport, AddPointsError> {
+    let pairs = candidate_pairs(model, new_images, &options.candidate_pairs);
+    let done = AtomicUsize::new(0);
+    let one_more = || progress(done.fetch_add(1, Ordering::Relaxed) + 1, pairs.len());
+    let mut matcher = PairMatcher::new(model, features, options, seed);
+    let mut matches = Vec::with_capacity(pairs.len());
+    for tile in tiles(model, &pairs, &options.blocks) {
+        matcher.prepare(&tile, cancelled)?;
+        matches.extend(matcher.match_pairs(&tile, &one_more, cancelled)?);
+    }
+    add_matches(model, matches, options, cancelled)
 }

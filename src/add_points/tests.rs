@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use nalgebra::Vector3;
 
 use super::pair_matcher::shared_observations;
-use super::test_scene::{SceneSpec, TestScene, build};
+use super::test_scene::{SceneSpec, TestScene, add_points, build};
 use super::*;
 use crate::matching::descriptor::distance_sq;
 use crate::scene::{KeypointIdx, Observation};

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::Failure;
-use super::data_dir::{block_on, existing_database};
+use super::data_dir::{block_on, existing_database, outside};
 use crate::store::{Db, back_up};
 
 /// Arguments of `multistage backup`.
@@ -23,7 +23,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 async fn copy(args: &Args) -> Result<(), Failure> {
-    let outside = |error: &dyn std::fmt::Display| Failure::Outside(format!("{}: {error}", args.data_dir.display()));
+    let outside = outside(&args.data_dir);
     let database = existing_database(&args.data_dir)?;
     let db = Db::open(&database).await.map_err(|error| outside(&error))?;
     let account = back_up(&db, &args.data_dir, &args.to).await.map_err(|error| outside(&error))?;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::Failure;
-use super::data_dir::{block_on, existing_database};
+use super::data_dir::{block_on, existing_database, outside};
 use crate::jobs::{Stale, find_stale, remove_stale};
 use crate::store::{DataDir, Db, Store};
 
@@ -28,7 +28,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 async fn clean_up(args: &Args) -> Result<(), Failure> {
-    let outside = |error: &dyn std::fmt::Display| Failure::Outside(format!("{}: {error}", args.data_dir.display()));
+    let outside = outside(&args.data_dir);
     let database = existing_database(&args.data_dir)?;
     let keep = Duration::from_secs(24 * 3600 * u64::from(args.keep_days));
     let db = Db::open(&database).await.map_err(|error| outside(&error))?;

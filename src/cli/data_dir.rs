@@ -1,5 +1,6 @@
 //! What the commands that work on a data directory, beside the service, begin with.
 
+use std::fmt::Display;
 use std::future::Future;
 use std::path::{Path, PathBuf};
 
@@ -13,6 +14,11 @@ pub(super) fn block_on(work: impl Future<Output = Result<(), Failure>>) -> Resul
         .build()
         .map_err(|error| Failure::Outside(format!("can't start the runtime: {error}")))?;
     runtime.block_on(work)
+}
+
+/// A failure of what lies in a data directory.
+pub(super) fn outside(data_dir: &Path) -> impl Fn(&dyn Display) -> Failure {
+    move |error| Failure::Outside(format!("{}: {error}", data_dir.display()))
 }
 
 /// The database of a data directory that is there already.

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::Failure;
-use super::data_dir::{block_on, existing_database};
+use super::data_dir::{block_on, existing_database, outside};
 use crate::store::{DataDir, Db, Finding, examine};
 
 /// Arguments of `multistage doctor`.
@@ -26,7 +26,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 async fn look(args: &Args) -> Result<(), Failure> {
-    let outside = |error: &dyn std::fmt::Display| Failure::Outside(format!("{}: {error}", args.data_dir.display()));
+    let outside = outside(&args.data_dir);
     let database = existing_database(&args.data_dir)?;
     // Before looking: what a running service is about to store must not be taken for an orphan.
     let own =

@@ -120,9 +120,8 @@ fn gradients_body<const FMA: bool>(
         let (above, below, window) = (&above[span.clone()], &below[span.clone()], &window[span.clone()]);
         let (left, right) = (&row[span.clone()], &row[span.start + 2..span.end + 2]);
         for i in 0..LANES {
-            let (gx, gy) = (right[i] - left[i], below[i] - above[i]);
-            weight[i] = (gx * gx + gy * gy).sqrt() * window[i] * row_weight;
-            direction[i] = direction_of::<FMA>(gx, gy);
+            let gradient = (right[i] - left[i], below[i] - above[i]);
+            (weight[i], direction[i]) = polar::<FMA>(gradient, window[i], row_weight);
         }
     }
 }
@@ -144,10 +143,15 @@ fn gradients_of_every_second_body<const FMA: bool>(
     let row = &row.as_chunks::<2>().0[..count + 1];
     let (window, direction) = (&window[..count], &mut direction[..count]);
     for i in 0..count {
-        let (gx, gy) = (row[i + 1][0] - row[i][0], below[i][0] - above[i][0]);
-        weight[i] = (gx * gx + gy * gy).sqrt() * window[i] * row_weight;
-        direction[i] = direction_of::<FMA>(gx, gy);
+        let gradient = (row[i + 1][0] - row[i][0], below[i][0] - above[i][0]);
+        (weight[i], direction[i]) = polar::<FMA>(gradient, window[i], row_weight);
     }
+}
+
+/// Weighted length and direction of a gradient.
+#[inline(always)]
+fn polar<const FMA: bool>((x, y): (f32, f32), column_weight: f32, row_weight: f32) -> (f32, f32) {
+    ((x * x + y * y).sqrt() * column_weight * row_weight, direction_of::<FMA>(x, y))
 }
 
 /// The angle of (x, y) in [0, 2 pi), within 1e-5: an odd polynomial for the arc tangent of the smaller over the larger

@@ -2,19 +2,10 @@
 
 use std::time::{Duration, Instant};
 
+use multistage::math::Rng;
 use tokio::io::AsyncWriteExt;
 
 use crate::client::{Tus, pattern, status_of};
-
-/// A small generator, seeded, so that a failure can be repeated.
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, end: usize) -> usize {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        ((self.0 >> 33) as usize) % end
-    }
-}
 
 /// Waits until the server has counted so many bytes, which the broken request sent.
 async fn settled(tus: &Tus, upload: &str, sent: u64) -> u64 {
@@ -43,7 +34,7 @@ async fn break_off(fault: Fault, breaks: usize, seed: u64) {
     const LENGTH: usize = 40_000;
     let tus = Tus::start().await;
     let bytes = pattern(LENGTH);
-    let mut random = Random(seed);
+    let mut random = Rng::from_parts(&[seed]);
     let (mut broken, mut number) = (0, 0);
     while broken < breaks {
         let upload = tus.create(&[("upload-length", &LENGTH.to_string())]).await;
