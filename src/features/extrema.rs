@@ -3,6 +3,11 @@
 //!
 //! Around a grid point D(d) = D + g'd + d'Hd/2 with g, H from central differences; its extremum is d = -H^-1 g, where
 //! D is D + g'd/2. While d leaves the cell, the fit moves on to the neighbouring grid point.
+//!
+//! Central differences take the third and fourth derivatives for nothing, which at the finest level of an octave (sigma 1.2
+//! of its pixels) draws d towards the grid point by up to 0.07 pixels, as much as all other errors of a sharp photograph. So
+//! an extremum that is kept is settled by two more steps d <- d - H^-1 g(d), where g(d) is the gradient at d itself: of the
+//! polynomial of fourth degree through five columns and rows, and of second degree through three levels.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -20,6 +25,10 @@ const MOVE_OFFSET: f32 = 0.6;
 pub(super) const MAX_OFFSET: f32 = 1.0;
 /// Fits tried per extremum.
 const MAX_FITS: usize = 5;
+/// Steps that settle a fitted extremum; each leaves about a seventh of the error.
+const SETTLING_STEPS: usize = 2;
+/// Settling farther than this, in any coordinate, is not believed.
+const MAX_SETTLING: f32 = 0.3;
 /// The grid test passes values above this part of the threshold, since the refined extremum is higher.
 const GRID_PART: f32 = 0.8;
 /// Pixels tested together.
@@ -167,7 +176,7 @@ fn extremum_lanes(
 pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &SiftOptions) -> Option<Extremum> {
     let (mut x, mut y, mut s, first_y) = (x, y, s, y);
     for fit in 1..=MAX_FITS {
-        let cube = neighbourhood(levels, x, y, s);
+        let cube = neighbourhood::<3>(levels, x, y, s);
         let at = |dx: usize, dy: usize, ds: usize| cube[ds][dy][dx];
         let value = at(1, 1, 1);
         let gradient =
@@ -179,7 +188,8 @@ pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &Si
         let xs = 0.25 * (at(2, 1, 2) + at(0, 1, 0) - at(0, 1, 2) - at(2, 1, 0));
         let ys = 0.25 * (at(1, 2, 2) + at(1, 0, 0) - at(1, 0, 2) - at(1, 2, 0));
         let hessian = Matrix3::new(xx, xy, xs, xy, yy, ys, xs, ys, ss);
-        let offset = -(hessian.try_inverse()? * gradient);
+        let inverse = hessian.try_inverse()?;
+        let offset = -(inverse * gradient);
         if !offset.iter().all(|component| component.is_finite()) {
             return None;
         }
@@ -189,8 +199,12 @@ pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &Si
             let edge = options.edge_threshold;
             let keeps =
                 contrast.abs() > options.peak_threshold && trace * trace * edge < (edge + 1.0).powi(2) * determinant;
+            if !keeps {
+                return None;
+            }
+            let offset = settle(levels, (x, y, s), &inverse, offset);
             let (fx, fy, level) = (x as f32 + offset.x, y as f32 + offset.y, s as f32 + offset.z);
-            return keeps.then_some(Extremum { x: fx, y: fy, level, s });
+            return Some(Extremum { x: fx, y: fy, level, s });
         }
         x = step(x, offset.x, 1, levels.width - 2)?;
         y = step(y, offset.y, 1, levels.height - 2)?;
@@ -200,6 +214,70 @@ pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &Si
         }
     }
     None
+}
+
+/// Moves an extremum, found at `offset` from a grid point, to where the gradient of a higher polynomial vanishes (see the
+/// head of this file); stays where it is at the border of the image or where the two disagree by [`MAX_SETTLING`].
+fn settle(
+    levels: &Levels,
+    (x, y, s): (usize, usize, usize),
+    inverse: &Matrix3<f32>,
+    offset: Vector3<f32>,
+) -> Vector3<f32> {
+    if x < 2 || y < 2 || x + 2 >= levels.width || y + 2 >= levels.height {
+        return offset;
+    }
+    let cube = neighbourhood::<5>(levels, x, y, s);
+    let mut at = offset;
+    for _ in 0..SETTLING_STEPS {
+        at -= inverse * gradient_at(&cube, &at);
+    }
+    if (at - offset).amax() < MAX_SETTLING { at } else { offset }
+}
+
+/// The gradient (x, y, level) at an offset from the middle of a cube of differences.
+fn gradient_at(cube: &[[[f32; 5]; 5]; 3], at: &Vector3<f32>) -> Vector3<f32> {
+    let (values_x, slopes_x) = weights_of_five(at.x);
+    let (values_y, slopes_y) = weights_of_five(at.y);
+    let t = at.z;
+    let (values_s, slopes_s) = ([0.5 * t * (t - 1.0), 1.0 - t * t, 0.5 * t * (t + 1.0)], [t - 0.5, -2.0 * t, t + 0.5]);
+    let mut gradient = Vector3::zeros();
+    for (plane, (value_s, slope_s)) in cube.iter().zip(values_s.iter().zip(slopes_s)) {
+        let (mut value, mut along_x, mut along_y) = (0.0, 0.0, 0.0);
+        for (line, (value_y, slope_y)) in plane.iter().zip(values_y.iter().zip(slopes_y)) {
+            let (mut line_value, mut line_slope) = (0.0, 0.0);
+            for ((difference, value_x), slope_x) in line.iter().zip(values_x).zip(slopes_x) {
+                line_value += value_x * difference;
+                line_slope += slope_x * difference;
+            }
+            value += value_y * line_value;
+            along_x += value_y * line_slope;
+            along_y += slope_y * line_value;
+        }
+        gradient += Vector3::new(value_s * along_x, value_s * along_y, slope_s * value);
+    }
+    gradient
+}
+
+/// Value and derivative at `t` of the polynomial of fourth degree through values at -2..2, as weights of these values
+/// (Lagrange's formula).
+fn weights_of_five(t: f32) -> ([f32; 5], [f32; 5]) {
+    let (t2, t3, t4) = (t * t, t * t * t, t * t * t * t);
+    let values = [
+        (t4 - 2.0 * t3 - t2 + 2.0 * t) / 24.0,
+        (-t4 + t3 + 4.0 * t2 - 4.0 * t) / 6.0,
+        (t4 - 5.0 * t2 + 4.0) / 4.0,
+        (-t4 - t3 + 4.0 * t2 + 4.0 * t) / 6.0,
+        (t4 + 2.0 * t3 - t2 - 2.0 * t) / 24.0,
+    ];
+    let slopes = [
+        (4.0 * t3 - 6.0 * t2 - 2.0 * t + 2.0) / 24.0,
+        (-4.0 * t3 + 3.0 * t2 + 8.0 * t - 4.0) / 6.0,
+        (4.0 * t3 - 10.0 * t) / 4.0,
+        (-4.0 * t3 - 3.0 * t2 + 8.0 * t + 4.0) / 6.0,
+        (4.0 * t3 + 6.0 * t2 - 2.0 * t - 2.0) / 24.0,
+    ];
+    (values, slopes)
 }
 
 /// One grid step towards an offset beyond [`MOVE_OFFSET`]; none when it leaves `[least, most]`.
@@ -214,15 +292,16 @@ fn step(at: usize, offset: f32, least: usize, most: usize) -> Option<usize> {
     (least..=most).contains(&next).then_some(next)
 }
 
-/// The 27 differences around a pixel, by level, row, column.
-fn neighbourhood(levels: &Levels, x: usize, y: usize, s: usize) -> [[[f32; 3]; 3]; 3] {
-    let mut cube = [[[0.0; 3]; 3]; 3];
+/// The differences around a pixel by level, row, column: three levels of `SIDE` by `SIDE` pixels.
+fn neighbourhood<const SIDE: usize>(levels: &Levels, x: usize, y: usize, s: usize) -> [[[f32; SIDE]; SIDE]; 3] {
+    let half = SIDE / 2;
+    let mut cube = [[[0.0; SIDE]; SIDE]; 3];
     for (ds, plane) in cube.iter_mut().enumerate() {
         for (dy, line) in plane.iter_mut().enumerate() {
-            let upper = &levels.rings[s + ds].row(y + dy - 1)[x - 1..x + 2];
-            let lower = &levels.rings[s + ds - 1].row(y + dy - 1)[x - 1..x + 2];
-            for dx in 0..3 {
-                line[dx] = upper[dx] - lower[dx];
+            let upper = &levels.rings[s + ds].row(y + dy - half)[x - half..=x + half];
+            let lower = &levels.rings[s + ds - 1].row(y + dy - half)[x - half..=x + half];
+            for (difference, (upper, lower)) in line.iter_mut().zip(upper.iter().zip(lower)) {
+                *difference = upper - lower;
             }
         }
     }
