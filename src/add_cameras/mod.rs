@@ -86,29 +86,6 @@ pub struct AddedImage {
     pub inliers: usize,
 }
 
-/// The whole stage for one model: localises `queries` in parallel, and adds those that could be.
-///
-/// # Errors
-/// When cancelled.
-#[expect(clippy::too_many_arguments, reason = "the stage's inputs, each of another kind; mirrors the other stages")]
-pub fn add_cameras(
-    model: &mut Reconstruction,
-    queries: &[QueryImage],
-    features: &LoadFeatures,
-    match_counts: &MatchCounts,
-    options: &AddCamerasOptions,
-    seed: u64,
-    progress: &Progress,
-    cancelled: &Cancelled,
-) -> Result<AddCamerasReport, AddCamerasCancelled> {
-    if queries.is_empty() {
-        return Ok(AddCamerasReport::default());
-    }
-    let snapshot = ModelSnapshot::build(model, features, options);
-    let found = localize_all(&snapshot, model, queries, features, match_counts, options, seed, progress, cancelled)?;
-    Ok(add_localized(model, &snapshot, found, features, options, seed))
-}
-
 /// What localising an image gave.
 pub type Outcome = Result<Localized, LocalizeFailure>;
 

@@ -46,7 +46,11 @@ impl Held {
     fn run(&mut self, options: &AddCamerasOptions) -> AddCamerasReport {
         let features = &self.features;
         let load = |id: ImageId| features[&id].clone();
-        add_cameras(&mut self.model, &self.queries, &load, &self.counts, options, SEED, &|_, _| (), &|| false).unwrap()
+        let snapshot = ModelSnapshot::build(&self.model, &load, options);
+        let (model, counts) = (&self.model, &self.counts);
+        let found =
+            localize_all(&snapshot, model, &self.queries, &load, counts, options, SEED, &|_, _| (), &|| false).unwrap();
+        add_localized(&mut self.model, &snapshot, found, &load, options, SEED)
     }
 
     fn localize(&self, options: &AddCamerasOptions) -> Result<Localized, LocalizeFailure> {
@@ -295,23 +299,14 @@ fn far_inliers_do_not_enter_the_tracks() {
 }
 
 #[test]
-fn cancelling_leaves_the_model_alone() {
-    let mut held = hold_out(&cluttered(), &[4]);
-    let features = &held.features;
-    let load = |id: ImageId| features[&id].clone();
-    let before = held.model.num_observations();
-    let outcome = add_cameras(
-        &mut held.model,
-        &held.queries,
-        &load,
-        &held.counts,
-        &AddCamerasOptions::default(),
-        SEED,
-        &|_, _| (),
-        &|| true,
-    );
-    assert_eq!(outcome, Err(AddCamerasCancelled));
-    assert_eq!(held.model.num_observations(), before);
+fn cancelling_ends_the_search() {
+    let held = hold_out(&cluttered(), &[4]);
+    let load = |id: ImageId| held.features[&id].clone();
+    let options = AddCamerasOptions::default();
+    let snapshot = ModelSnapshot::build(&held.model, &load, &options);
+    let (queries, counts) = (&held.queries, &held.counts);
+    let outcome = localize_all(&snapshot, &held.model, queries, &load, counts, &options, SEED, &|_, _| (), &|| true);
+    assert_eq!(outcome.err(), Some(AddCamerasCancelled));
 }
 
 #[test]

@@ -69,18 +69,12 @@ impl PointAdder<'_> {
         let mut matches: Vec<PairMatches> = Vec::with_capacity(pairs.len());
         let mut reused = 0;
         for tile in tiles(model, pairs, &self.options.blocks) {
-            let mut waiting = Vec::new();
-            for unit in tile.chunks(UNIT_PAIRS) {
-                self.context.check_cancelled()?;
-                match self.units.known::<Vec<PairMatches>>(&(rank, unit))? {
-                    Some(known) => {
-                        reused += unit.len();
-                        more(unit.len());
-                        matches.extend(known);
-                    }
-                    None => waiting.push(unit),
-                }
-            }
+            self.context.check_cancelled()?;
+            let (known, waiting): (Vec<Vec<PairMatches>>, _) = self.units.split(rank, tile.chunks(UNIT_PAIRS))?;
+            let count = tile.len() - waiting.iter().map(|unit| unit.len()).sum::<usize>();
+            reused += count;
+            more(count);
+            matches.extend(known.into_iter().flatten());
             self.expect(matcher.prepare(waiting.iter().copied().flatten(), &cancelled))?;
             let found = waiting.into_par_iter().map(|unit| {
                 let found = self.expect(matcher.match_pairs(unit, &|| more(1), &cancelled))?;

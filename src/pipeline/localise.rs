@@ -106,17 +106,10 @@ impl Localiser<'_> {
         let cancelled = || self.context.cancel.is_cancelled();
         let load = |id: ImageId| -> Arc<Features> { self.cache.get(id) };
         let (options, seed) = (&self.options.add_cameras, self.context.seed);
-        let (mut found, mut waiting) = (BTreeMap::new(), Vec::new());
-        for unit in queries.chunks(UNIT_IMAGES) {
-            match self.units.known::<BTreeMap<ImageId, Outcome>>(&(rank, unit))? {
-                Some(known) => {
-                    more(known.len());
-                    found.extend(known);
-                }
-                None => waiting.push(unit),
-            }
-        }
+        let (known, waiting) = self.units.split(rank, queries.chunks(UNIT_IMAGES))?;
+        let mut found: BTreeMap<ImageId, Outcome> = known.into_iter().flat_map(BTreeMap::into_iter).collect();
         let reused = found.len();
+        more(reused);
         let localized = waiting.into_par_iter().map(|unit| {
             let told = |_, _| more(1);
             let outcomes =

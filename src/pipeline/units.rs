@@ -38,6 +38,25 @@ impl<'a> Units<'a> {
         Ok(bytes.and_then(|bytes| postcard::from_bytes(&bytes).ok()))
     }
 
+    /// Of the units that `cut` gives, each part of the work of the model `rank`: what an earlier run found for some, and the others.
+    ///
+    /// # Errors
+    /// As [`Units::known`]'s.
+    pub fn split<'u, I: Serialize, T: DeserializeOwned>(
+        &self,
+        rank: usize,
+        cut: impl Iterator<Item = &'u [I]>,
+    ) -> Result<(Vec<T>, Vec<&'u [I]>), PipelineError> {
+        let (mut known, mut waiting) = (Vec::new(), Vec::new());
+        for unit in cut {
+            match self.known(&(rank, unit))? {
+                Some(found) => known.push(found),
+                None => waiting.push(unit),
+            }
+        }
+        Ok((known, waiting))
+    }
+
     /// Keeps what was found for a unit.
     ///
     /// # Errors
