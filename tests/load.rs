@@ -9,7 +9,9 @@
 
 mod program;
 
-use std::io::Write;
+#[path = "load/many.rs"]
+mod many;
+
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -22,7 +24,7 @@ use multistage::store::db::job_outputs::{self, JobOutputRow};
 use multistage::store::db::jobs::{self, NewJobRow};
 use multistage::store::{DataDir, Db};
 use program::Program;
-use reqwest::{Client, Method, Response};
+use reqwest::{Client, Response};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
@@ -31,17 +33,6 @@ const SENDERS: usize = 50;
 const LISTENERS: usize = 200;
 /// Seconds within which 99 of 100 writes to the database must be done, in their queue too, without the disk's syncs.
 const WRITE_LIMIT_S: f64 = 0.05;
-/// Connections that bring the many photographs.
-const CONNECTIONS: usize = 8;
-/// Of each of the many photographs, unless `MULTISTAGE_LOAD_FILE_BYTES` says otherwise.
-const FILE_BYTES: usize = 4 << 20;
-/// Folders that they go to.
-const FOLDERS: usize = 100;
-/// Files that one thread writes, for comparison.
-const ONE_BY_ONE: usize = 500;
-/// Share of what the disk gives that uploads must reach. A short run tells little, so it only has to be in reach.
-const SHARE_OF_DISK: f64 = 0.7;
-const SHARE_OF_DISK_SHORT: f64 = 0.2;
 /// Between the middle and the end of a run memory may grow by so much: what allocators keep.
 const MEMORY_SLACK_BYTES: u64 = 48 << 20;
 
@@ -235,104 +226,6 @@ async fn senders_and_listeners_at_once() {
         middle >> 20,
         end >> 20,
     );
-}
-
-/// Where the `number`th of the many photographs goes.
-fn place(number: usize) -> String {
-    format!("{}/{number}.jpg", number % FOLDERS)
-}
-
-/// The time that the disk takes for whole files of so many threads, each synced, renamed and its folder synced.
-fn disk_time(folder: &Path, files: usize, size: usize, threads: usize) -> Duration {
-    let bytes = content(0, size);
-    let raw = tempfile::tempdir_in(folder).unwrap();
-    for folder in 0..FOLDERS {
-        std::fs::create_dir(raw.path().join(folder.to_string())).unwrap();
-    }
-    let start = Instant::now();
-    std::thread::scope(|scope| {
-        for thread in 0..threads {
-            let (bytes, raw) = (&bytes, raw.path());
-            scope.spawn(move || {
-                for file in (thread..files).step_by(threads) {
-                    let (part, path) = (raw.join(format!("{file}.part")), raw.join(place(file)));
-                    let mut written = std::fs::File::create(&part).unwrap();
-                    written.write_all(bytes).unwrap();
-                    written.sync_all().unwrap();
-                    std::fs::rename(&part, &path).unwrap();
-                    std::fs::File::open(path.parent().unwrap()).unwrap().sync_all().unwrap();
-                }
-            });
-        }
-    });
-    start.elapsed()
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn many_photographs_through_tus() {
-    let wanted = number("MULTISTAGE_LOAD_FILES");
-    let files = wanted.unwrap_or(48);
-    let size = number("MULTISTAGE_LOAD_FILE_BYTES").unwrap_or(FILE_BYTES);
-    let folder = tempfile::tempdir().unwrap();
-    // Half of the files before and half after, because the disk is not the same all the time.
-    let mut disk = disk_time(folder.path(), files / 2, size, CONNECTIONS);
-    let program = Program::start_with(&folder.path().join("data"), &[]);
-    let base = program.base.clone();
-    let id = dataset(&Client::new(), &base).await;
-    let before = memory_bytes(program.id());
-    let start = Instant::now();
-    let next = Arc::new(AtomicUsize::new(0));
-    let senders: Vec<_> = (0..CONNECTIONS)
-        .map(|_| {
-            let (base, id, next) = (base.clone(), id.clone(), Arc::clone(&next));
-            tokio::spawn(async move {
-                let (http, bytes) = (Client::new(), content(0, size));
-                loop {
-                    let number = next.fetch_add(1, Ordering::Relaxed);
-                    if number >= files {
-                        return;
-                    }
-                    let mut bytes = bytes.clone();
-                    bytes[..8].copy_from_slice(&number.to_le_bytes());
-                    upload(&http, &base, &id, &place(number), bytes).await;
-                }
-            })
-        })
-        .collect();
-    let mut highest = before;
-    while next.load(Ordering::Relaxed) < files {
-        tokio::time::sleep(Duration::from_millis(100)).await;
-        highest = highest.max(memory_bytes(program.id()));
-    }
-    for sender in senders {
-        sender.await.unwrap();
-    }
-    let rate = (files * size) as f64 / start.elapsed().as_secs_f64();
-    let link = format!("{base}/api/v1/datasets/{id}");
-    let shown: Value = expect(Client::new().request(Method::GET, link), 200).await.json().await.unwrap();
-    assert_eq!(shown["images"], files);
-    assert!(highest < 200 << 20, "{highest} bytes of memory");
-    drop(program);
-    std::fs::remove_dir_all(folder.path().join("data")).unwrap();
-    disk += disk_time(folder.path(), files - files / 2, size, CONNECTIONS);
-    let one_by_one =
-        (files.min(ONE_BY_ONE) * size) as f64 / disk_time(folder.path(), files.min(ONE_BY_ONE), size, 1).as_secs_f64();
-    let disk = (files * size) as f64 / disk.as_secs_f64();
-    let share = rate / disk;
-    let least = if wanted.is_some() { SHARE_OF_DISK } else { SHARE_OF_DISK_SHORT };
-    let mb = |rate: f64| rate / 1e6;
-    let memory = highest >> 20;
-    let said = format!(
-        "{files} photographs of {} KiB over {CONNECTIONS} connections: {:.0} MB/s, {share:.2} of the disk's {:.0} MB/s \
-         with as many threads ({:.0} MB/s with one); memory {} to {memory} MiB",
-        size >> 10,
-        mb(rate),
-        mb(disk),
-        mb(one_by_one),
-        before >> 20
-    );
-    assert!(share >= least, "{said}");
-    println!("{said}");
 }
 
 /// Of the outputs of a job, in an ordinary run.
