@@ -165,7 +165,11 @@ impl DataDir {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
             Err(error) => return Err(error),
         }
-        atomic::sync_parent(folder)?;
+        match atomic::sync_parent(folder) {
+            // Somebody deletes the parent as well.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            other => other?,
+        }
         std::fs::remove_dir_all(&grave)
     }
 }

@@ -23,6 +23,8 @@ use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
+use tokio::sync::Mutex;
+
 pub use archive::{ArchiveError, ArchiveLimits, unpack};
 pub use artifacts::ArtifactStore;
 pub use backup::{BackedUp, back_up};
@@ -53,6 +55,8 @@ pub struct Store {
     group: GroupCommit,
     claims: Claims,
     folders: Arc<DurableFolders>,
+    /// Held by whoever removes deleted folders.
+    discarding: Mutex<()>,
 }
 
 /// Why the store refused or failed.
@@ -132,15 +136,18 @@ impl Store {
             group,
             claims: Claims::default(),
             folders: Arc::default(),
+            discarding: Mutex::default(),
         })
     }
 
     /// Removes the folders of deleted jobs and datasets. What can't be removed stays on the list for the next time and is told to
-    /// the log: it costs space, no more.
+    /// the log: it costs space, no more. One after the other: at once, each would remove what is on the others' lists, and a folder could
+    /// leave the list before whoever moved it away has made that durable.
     ///
     /// # Errors
     /// What SQLite said.
     pub async fn discard_deleted(&self) -> Result<(), StoreError> {
+        let _alone = self.discarding.lock().await;
         if db::discards::is_held(self.db.reader(), db::now_ms()).await? {
             return Ok(());
         }
@@ -158,5 +165,31 @@ impl Store {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[tokio::test]
+    async fn deletions_at_once_remove_every_folder_once() {
+        const FOLDERS: u64 = 6;
+        let root = tempfile::tempdir().unwrap();
+        let store = Store::open(root.path()).await.unwrap();
+        let mut tx = store.db.write().await.unwrap();
+        for number in 0..FOLDERS {
+            let folder = format!("datasets/{number}");
+            std::fs::create_dir_all(root.path().join(&folder).join("images")).unwrap();
+            sqlx::query("INSERT INTO discards (folder) VALUES (?)").bind(folder).execute(&mut *tx).await.unwrap();
+        }
+        tx.commit().await.unwrap();
+        let writes = || store.db.write_figures().counts.iter().sum::<u64>();
+        let before = writes();
+        let (a, b, c) = tokio::join!(store.discard_deleted(), store.discard_deleted(), store.discard_deleted());
+        assert!(a.is_ok() && b.is_ok() && c.is_ok());
+        assert_eq!(std::fs::read_dir(root.path().join("datasets")).unwrap().count(), 0);
+        assert_eq!(writes() - before, FOLDERS, "each leaves the list once");
     }
 }
