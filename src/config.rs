@@ -20,6 +20,11 @@ pub struct UploadLimits {
     pub max_files: usize,
     /// Bytes of one photograph.
     pub max_file_bytes: u64,
+    /// A photograph of at most so many bytes that comes whole with the request that makes its resumable upload waits in memory until
+    /// all of it is there; others are written as they come.
+    pub memory_file_bytes: u64,
+    /// Memory of all that wait so; when it is used up, they too are written as they come.
+    pub memory_bytes: u64,
     /// Unpacking.
     pub archive: ArchiveLimits,
 }
@@ -30,6 +35,8 @@ impl Default for UploadLimits {
             max_upload_bytes: 256 << 30,
             max_files: 100_000,
             max_file_bytes: 1 << 30,
+            memory_file_bytes: 4 << 20,
+            memory_bytes: 32 << 20,
             archive: ArchiveLimits::default(),
         }
     }
@@ -184,6 +191,7 @@ impl ServerConfig {
                 max_files: 5_000,
                 max_file_bytes: 4 << 20,
                 archive: ArchiveLimits { max_entries: 2_000, max_file_bytes: 4 << 20, ..ArchiveLimits::default() },
+                ..UploadLimits::default()
             },
             webhooks: WebhookPolicy { first_pause: Duration::from_millis(20), ..WebhookPolicy::default() },
             upload_idle_timeout: Duration::from_secs(5),

@@ -29,3 +29,5 @@ mod offsets;
 mod overrides;
 #[path = "tus/termination.rs"]
 mod termination;
+#[path = "tus/whole.rs"]
+mod whole;

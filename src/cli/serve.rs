@@ -75,6 +75,14 @@ pub(super) struct Args {
     /// Photographs that one upload may bring [default: 100000].
     #[arg(long, env = "MULTISTAGE_MAX_FILES")]
     max_files: Option<NonZeroUsize>,
+    /// Bytes up to which a photograph waits in memory until all of it has come; larger ones are written as they come. 0 for none
+    /// [default: 4 MiB].
+    #[arg(long, env = "MULTISTAGE_UPLOAD_MEMORY_FILE_BYTES")]
+    upload_memory_file_bytes: Option<u64>,
+    /// Bytes of memory that all photographs that wait so may take; when they are used up, further ones are written as they come
+    /// [default: 32 MiB].
+    #[arg(long, env = "MULTISTAGE_UPLOAD_MEMORY_BYTES")]
+    upload_memory_bytes: Option<u64>,
     /// Seed of every job's random choices.
     #[arg(long, default_value = "0")]
     seed: u64,
@@ -117,6 +125,8 @@ impl Args {
         uploads.max_upload_bytes = self.max_upload_bytes.map_or(uploads.max_upload_bytes, NonZeroU64::get);
         uploads.archive.max_total_bytes = uploads.max_upload_bytes;
         uploads.max_files = self.max_files.map_or(uploads.max_files, NonZeroUsize::get);
+        uploads.memory_file_bytes = self.upload_memory_file_bytes.unwrap_or(uploads.memory_file_bytes);
+        uploads.memory_bytes = self.upload_memory_bytes.unwrap_or(uploads.memory_bytes);
         config
     }
 }

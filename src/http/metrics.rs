@@ -149,7 +149,12 @@ impl Metrics {
             &histogram(writes),
         );
         let syncs = plain(format!("{:.3}", writes.syncs.as_secs_f64()));
-        family("multistage_store_sync_seconds_total", "counter", "Time in which a sync was under way.", &syncs);
+        family(
+            "multistage_store_sync_seconds_total",
+            "counter",
+            "Time in which a commit to the database waited for the disk.",
+            &syncs,
+        );
         if let Some(free) = disk_free_bytes {
             family("multistage_disk_free_bytes", "gauge", "Room on the disk.", &plain(free.to_string()));
         }

@@ -60,6 +60,8 @@ pub struct AppState {
     rates: Arc<RateLimits>,
     /// The resumable uploads that requests work on.
     uploads: tus::UploadLocks,
+    /// Bounds the memory that photographs on their way take.
+    waiting: tus::WaitingRoom,
     /// Bounds the memory that decoding takes.
     decoders: Arc<Semaphore>,
 }
@@ -70,6 +72,7 @@ impl AppState {
         let rates = RateLimits::new(config.access.requests_per_s, config.access.failures_per_min);
         Self {
             jobs,
+            waiting: tus::WaitingRoom::new(&config.uploads),
             config: Arc::new(config),
             rates: Arc::new(rates),
             metrics: Arc::default(),

@@ -1,25 +1,23 @@
 //! Many small writes made durable together.
 //!
-//! A commit waits for the disk, and one that waits can take others along: requests hand their writes to one task, which syncs the
-//! folders that any of them touched, writes all of them in one transaction, commits it and tells each. While it waits for the disk
-//! the next ones gather, so the more requests there are the fewer syncs each costs, and a lone one waits for nobody.
+//! A commit waits for the disk, and one that waits can take others along: requests hand their writes to one task, which
+//! makes all of them in one transaction, commits it and tells each. While it waits for the disk the next ones gather, so the more
+//! requests there are the fewer syncs each costs, and a lone one waits for nobody. Files and folders that a write speaks of are durable
+//! before it is handed over: each request syncs its own, side by side with the others.
 //! A transaction that fails, or in which one write refuses, is undone and taken apart: whoever refused is asked alone and the others
 //! together once more, and when that fails too, one by one. So everybody learns of their own failure and of no other, and what is
 //! rare costs those who meet it; savepoints would cost everybody.
 
-use std::collections::BTreeSet;
 use std::io;
 use std::panic::AssertUnwindSafe;
-use std::path::PathBuf;
 
 use futures_util::FutureExt;
 use futures_util::future::BoxFuture;
 use sqlx::SqliteConnection;
 use tokio::sync::{mpsc, oneshot};
-use tokio::task::JoinSet;
 
-use super::db::write::{Stopwatch, Syncing, WaitsFor};
-use super::{Db, StoreError, atomic};
+use super::db::write::Stopwatch;
+use super::{Db, StoreError};
 
 /// Writes of one transaction.
 const MAX_WRITES: usize = 256;
@@ -33,9 +31,6 @@ pub(super) struct GroupCommit {
 
 /// What one request writes, and how it learns what became of it.
 trait Write: Send {
-    /// Folders whose entries must be durable before the row is.
-    fn folders(&self) -> &[PathBuf];
-
     /// Writes and notes the outcome; whether it is one to keep.
     fn run<'a>(&'a mut self, tx: &'a mut SqliteConnection) -> BoxFuture<'a, bool>;
 
@@ -44,7 +39,6 @@ trait Write: Send {
 }
 
 struct Request<T, E, F> {
-    folders: Vec<PathBuf>,
     work: F,
     outcome: Option<Result<T, E>>,
     answer: oneshot::Sender<Result<T, E>>,
@@ -57,10 +51,6 @@ where
     E: From<StoreError> + Send,
     F: for<'c> Fn(&'c mut SqliteConnection) -> BoxFuture<'c, Result<T, E>> + Send + Sync,
 {
-    fn folders(&self) -> &[PathBuf] {
-        &self.folders
-    }
-
     fn run<'a>(&'a mut self, tx: &'a mut SqliteConnection) -> BoxFuture<'a, bool> {
         Box::pin(async {
             let outcome = (self.work)(tx).await;
@@ -91,20 +81,20 @@ impl GroupCommit {
         Self { db: db.clone(), waiting }
     }
 
-    /// Makes the entries of `folders` durable, then what `work` writes, and gives what `work` gave. `work` may be asked again, when
+    /// Makes durable what `work` writes, and gives what `work` gave. `work` may be asked again, when
     /// the transaction that it was part of failed.
     ///
     /// # Errors
     /// What `work` refused, or what the system or SQLite said; nothing is written then.
-    pub(super) async fn commit<T, E, F>(&self, folders: Vec<PathBuf>, work: F) -> Result<T, E>
+    pub(super) async fn commit<T, E, F>(&self, work: F) -> Result<T, E>
     where
         T: Send + 'static,
         E: From<StoreError> + Send + 'static,
         F: for<'c> Fn(&'c mut SqliteConnection) -> BoxFuture<'c, Result<T, E>> + Send + Sync + 'static,
     {
         let (answer, answered) = oneshot::channel();
-        let stopwatch = Stopwatch::start(self.db.times(), WaitsFor::FoldersToo);
-        let request = Request { folders, work, outcome: None, answer, _stopwatch: stopwatch };
+        let stopwatch = Stopwatch::start(self.db.times());
+        let request = Request { work, outcome: None, answer, _stopwatch: stopwatch };
         self.waiting.send(Box::new(request)).map_err(|_| ended())?;
         answered.await.map_err(|_| ended())?
     }
@@ -152,9 +142,8 @@ async fn commit_together(db: &Db, mut writes: Vec<Box<dyn Write>>) {
     }
 }
 
-/// Syncs the folders, runs the writes and commits them; gives the first that refused, because of which nothing is written.
+/// Runs the writes and commits them; gives the first that refused, because of which nothing is written.
 async fn attempt(db: &Db, writes: &mut [Box<dyn Write>]) -> Result<Option<usize>, StoreError> {
-    sync_folders(db, writes.iter().flat_map(|write| write.folders()).cloned().collect()).await?;
     let mut tx = db.write_untimed().await?;
     for (at, write) in writes.iter_mut().enumerate() {
         if !write.run(&mut tx).await {
@@ -166,33 +155,13 @@ async fn attempt(db: &Db, writes: &mut [Box<dyn Write>]) -> Result<Option<usize>
     Ok(None)
 }
 
-async fn sync_folders(db: &Db, folders: BTreeSet<PathBuf>) -> Result<(), StoreError> {
-    if folders.is_empty() {
-        return Ok(());
-    }
-    let _syncing = Syncing::folders(db.times());
-    // Side by side: the disk syncs several as fast as one.
-    let mut syncs = JoinSet::new();
-    for folder in folders {
-        syncs.spawn_blocking(move || atomic::sync_dir(&folder));
-    }
-    while let Some(synced) = syncs.join_next().await {
-        match synced.map_err(io::Error::other)? {
-            // Deleted meanwhile, with what the writes speak of: they will see.
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-            other => other?,
-        }
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
 
     async fn write(group: &GroupCommit, name: &'static str, refuses: bool) -> Result<usize, StoreError> {
-        let written = group.commit(Vec::new(), move |tx| {
+        let written = group.commit(move |tx| {
             Box::pin(async move {
                 sqlx::query("INSERT INTO discards (folder) VALUES (?)").bind(name).execute(&mut *tx).await?;
                 if refuses { Err(StoreError::NotFound) } else { Ok(name.len()) }

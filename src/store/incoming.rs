@@ -37,6 +37,20 @@ enum Origin {
     Kept { file: PathBuf, scratch: PathBuf },
 }
 
+impl Origin {
+    /// A file that may be renamed.
+    fn into_temporary(self) -> io::Result<TempPath> {
+        match self {
+            Self::Temporary(file) => Ok(file),
+            Self::Kept { file, scratch } => {
+                let link = scratch.join(format!(".part-{}", Uuid::now_v7()));
+                std::fs::hard_link(file, &link)?;
+                TempPath::try_from_path(link)
+            }
+        }
+    }
+}
+
 impl StagedWriter {
     /// Starts a file in `scratch`, which lies on the file system of the datasets.
     ///
@@ -103,14 +117,20 @@ impl StagedFile {
     /// # Errors
     /// What the system said.
     pub(super) fn move_to(self, target: &Path) -> io::Result<()> {
-        let file = match self.origin {
-            Origin::Temporary(file) => file,
-            Origin::Kept { file, scratch } => {
-                let link = scratch.join(format!(".part-{}", Uuid::now_v7()));
-                std::fs::hard_link(file, &link)?;
-                TempPath::try_from_path(link)?
+        self.origin.into_temporary()?.persist(target).map_err(|failed| failed.error)
+    }
+
+    /// Renames it to where nothing lies; gives it back when something does.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub(super) fn move_if_free(self, target: &Path) -> io::Result<Option<Self>> {
+        match self.origin.into_temporary()?.persist_noclobber(target) {
+            Ok(()) => Ok(None),
+            Err(failed) if failed.error.kind() == io::ErrorKind::AlreadyExists => {
+                Ok(Some(Self { origin: Origin::Temporary(failed.path), ..self }))
             }
-        };
-        file.persist(target).map_err(|failed| failed.error)
+            Err(failed) => Err(failed.error),
+        }
     }
 }

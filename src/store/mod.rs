@@ -18,6 +18,7 @@ mod quota;
 mod resumable;
 mod space;
 mod token;
+mod whole;
 
 use std::io;
 use std::path::Path;
@@ -41,7 +42,7 @@ pub use placing::Committed;
 pub(crate) use quota::check as check_quota;
 pub use quota::{Quantity, Quota};
 pub use resumable::{Appended, Appender, NewUpload, UploadError, UploadKind};
-use space::Reservations;
+use space::{Promised, Reservations};
 pub use token::{Scope, create_token, find_token};
 
 /// The database and the files that belong to it.
@@ -52,6 +53,7 @@ pub struct Store {
     /// Files.
     pub data: DataDir,
     reservations: Reservations,
+    promised: Promised,
     group: GroupCommit,
     claims: Claims,
     folders: Arc<DurableFolders>,
@@ -133,6 +135,7 @@ impl Store {
             db,
             data,
             reservations: Reservations::default(),
+            promised: Promised::default(),
             group,
             claims: Claims::default(),
             folders: Arc::default(),

@@ -1,6 +1,6 @@
 //! Staged photographs enter their dataset.
 //!
-//! They are renamed into its folder by their own request, side by side with others; then the folders are synced and the rows
+//! They are renamed into its folder, and the folder synced, by their own request, side by side with others; then the rows are
 //! committed, together with those of other requests, and then the request is answered. A crash in between leaves at most files
 //! without rows, which nobody was told about; sending the same again mends that.
 
@@ -15,7 +15,7 @@ use uuid::Uuid;
 use super::db::dataset_images::DatasetImageRow;
 use super::db::uploads::UploadRow;
 use super::db::{dataset_images, datasets, now_ms, uploads};
-use super::{ImagePath, Quantity, StagedFile, Store, StoreError, check_quota};
+use super::{ImagePath, Quantity, StagedFile, Store, StoreError, atomic, check_quota};
 
 /// What became of a batch.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -24,6 +24,24 @@ pub struct Committed {
     pub stored: usize,
     /// Photographs that were there before with the same bytes.
     pub unchanged: usize,
+}
+
+/// What is noted of the upload that a photograph came by.
+#[derive(Clone, Debug)]
+pub(super) enum Note {
+    /// A row that is there changes.
+    Update(UploadRow),
+    /// A new one.
+    Insert(UploadRow),
+}
+
+impl Note {
+    async fn write(&self, tx: &mut SqliteConnection) -> sqlx::Result<()> {
+        match self {
+            Self::Update(row) => uploads::update(tx, row).await,
+            Self::Insert(row) => uploads::insert(tx, row).await,
+        }
+    }
 }
 
 /// Staged files, compared with what is stored.
@@ -57,14 +75,14 @@ impl Store {
         file: StagedFile,
         row: UploadRow,
     ) -> Result<(), StoreError> {
-        self.place(dataset, vec![file], Some(row)).await.map(|_| ())
+        self.place(dataset, vec![file], Some(Note::Update(row))).await.map(|_| ())
     }
 
     async fn place(
         self: &Arc<Self>,
         dataset: Uuid,
         files: Vec<StagedFile>,
-        upload: Option<UploadRow>,
+        upload: Option<Note>,
     ) -> Result<Committed, StoreError> {
         let store = Arc::clone(self);
         // In a task of its own: between the file and its row nothing may be given up.
@@ -76,11 +94,12 @@ impl Store {
         placing.await.map_err(io::Error::other)?
     }
 
-    async fn place_claimed(
+    /// The same for whoever has the claim on the paths.
+    pub(super) async fn place_claimed(
         &self,
         dataset: Uuid,
         files: Vec<StagedFile>,
-        upload: Option<UploadRow>,
+        upload: Option<Note>,
     ) -> Result<Committed, StoreError> {
         let sorted = self.sort(dataset, files).await?;
         let committed = Committed { stored: sorted.new.len(), unchanged: sorted.unchanged };
@@ -120,23 +139,22 @@ impl Store {
         Ok(sorted)
     }
 
-    async fn place_new(
-        &self,
-        dataset: Uuid,
-        files: Vec<StagedFile>,
-        upload: Option<UploadRow>,
-    ) -> Result<(), StoreError> {
-        let rows: Vec<DatasetImageRow> = files.iter().map(row).collect();
+    async fn place_new(&self, dataset: Uuid, files: Vec<StagedFile>, upload: Option<Note>) -> Result<(), StoreError> {
+        let rows: Vec<DatasetImageRow> = files.iter().map(image_row).collect();
         let (root, folder, folders) =
             (self.data.root().to_path_buf(), self.data.images(dataset), Arc::clone(&self.folders));
         let make = move |parent: &Path| folders.make(&root, parent);
-        let moving = tokio::task::spawn_blocking(move || Moved::into(&folder, make, files));
+        let moving = tokio::task::spawn_blocking(move || {
+            let (moved, failure) = Moved::into(&folder, make, files);
+            let failure = failure.or_else(|| moved.sync().err().map(StoreError::Io));
+            (moved, failure)
+        });
         let (moved, failure) = moving.await.map_err(io::Error::other)?;
         let written = match failure {
             Some(error) => Err(error),
             None => {
                 let write = Arc::new((rows, upload));
-                let written = self.group.commit(moved.folders(), move |tx| {
+                let written = self.group.commit(move |tx| {
                     let write = Arc::clone(&write);
                     Box::pin(async move { insert(tx, dataset, &write.0, write.1.as_ref()).await })
                 });
@@ -150,7 +168,7 @@ impl Store {
     }
 
     /// Removes files that got no row; gives the reason that counts.
-    async fn withdraw(&self, dataset: Uuid, moved: Moved, error: StoreError) -> StoreError {
+    pub(super) async fn withdraw(&self, dataset: Uuid, moved: Moved, error: StoreError) -> StoreError {
         // A folder that went with its dataset is no failure of the disk, and must not come back with a file in it.
         let is_gone = matches!(datasets::in_use(self.db.reader(), dataset).await, Ok(None));
         let (data, folder) = (self.data.clone(), self.data.dataset(dataset));
@@ -173,7 +191,12 @@ pub(super) async fn find_place(
     dataset: Uuid,
     path: &str,
 ) -> Result<datasets::PlaceRow, StoreError> {
-    match datasets::place(db, dataset, path).await? {
+    check_place(datasets::place(db, dataset, path).await?)
+}
+
+/// The same for what the database said of the path.
+pub(super) fn check_place(place: Option<datasets::PlaceRow>) -> Result<datasets::PlaceRow, StoreError> {
+    match place {
         None => Err(StoreError::NotFound),
         Some(place) if place.in_use => Err(StoreError::DatasetInUse),
         Some(place) => Ok(place),
@@ -188,7 +211,7 @@ async fn check_writable(db: &mut SqliteConnection, dataset: Uuid) -> Result<(), 
     }
 }
 
-fn row(file: &StagedFile) -> DatasetImageRow {
+pub(super) fn image_row(file: &StagedFile) -> DatasetImageRow {
     DatasetImageRow {
         path: file.path.as_str().to_owned(),
         size_bytes: i64::try_from(file.size_bytes).unwrap_or(i64::MAX),
@@ -200,12 +223,12 @@ async fn insert(
     tx: &mut SqliteConnection,
     dataset: Uuid,
     rows: &[DatasetImageRow],
-    upload: Option<&UploadRow>,
+    upload: Option<&Note>,
 ) -> Result<(), StoreError> {
     check_writable(tx, dataset).await?;
     if let Some(upload) = upload {
         // Before the quota is asked, so that nothing counts twice.
-        uploads::update(tx, upload).await?;
+        upload.write(tx).await?;
     }
     if rows.is_empty() {
         return Ok(());
@@ -217,9 +240,21 @@ async fn insert(
     check_quota(tx, owner.as_deref(), &[Quantity::Bytes, Quantity::Images]).await
 }
 
+/// Why a file could not be moved to its place.
+pub(super) fn move_error(error: io::Error, path: &ImagePath) -> StoreError {
+    match error.kind() {
+        // One name is a folder of the other: `a.jpg` and `a.jpg/b.jpg` can't both be stored.
+        io::ErrorKind::NotADirectory
+        | io::ErrorKind::IsADirectory
+        | io::ErrorKind::AlreadyExists
+        | io::ErrorKind::DirectoryNotEmpty => StoreError::FileConflict(path.to_string()),
+        _ => StoreError::Io(error),
+    }
+}
+
 /// Files that are in their places.
 #[derive(Debug, Default)]
-struct Moved {
+pub(super) struct Moved {
     files: Vec<PathBuf>,
 }
 
@@ -236,26 +271,25 @@ impl Moved {
             let target = folder.join(path.as_str());
             let parent = target.parent().unwrap_or(folder);
             match make(parent).and_then(|()| file.move_to(&target)) {
-                Ok(()) => moved.files.push(target),
-                Err(error) => {
-                    let error = match error.kind() {
-                        // One name is a folder of the other: `a.jpg` and `a.jpg/b.jpg` can't both be stored.
-                        io::ErrorKind::NotADirectory
-                        | io::ErrorKind::IsADirectory
-                        | io::ErrorKind::AlreadyExists
-                        | io::ErrorKind::DirectoryNotEmpty => StoreError::FileConflict(path.to_string()),
-                        _ => StoreError::Io(error),
-                    };
-                    return (moved, Some(error));
-                }
+                Ok(()) => moved.add(target),
+                Err(error) => return (moved, Some(move_error(error, &path))),
             }
         }
         (moved, None)
     }
 
-    /// Where they are.
-    fn folders(&self) -> Vec<PathBuf> {
+    /// Adds one that was moved just now.
+    pub(super) fn add(&mut self, file: PathBuf) {
+        self.files.push(file);
+    }
+
+    /// Makes their names durable. Blocking.
+    pub(super) fn sync(&self) -> io::Result<()> {
         let folders: BTreeSet<&Path> = self.files.iter().filter_map(|file| file.parent()).collect();
-        folders.into_iter().map(Path::to_path_buf).collect()
+        folders.into_iter().try_for_each(|folder| match atomic::sync_dir(folder) {
+            // Deleted meanwhile, with its dataset: whoever writes the rows will see.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+            other => other,
+        })
     }
 }

@@ -167,11 +167,13 @@ impl Store {
     /// A dataset that takes nothing now, a path stored with another length, or what the store said.
     pub async fn create_upload(&self, new: NewUpload) -> Result<UploadRow, UploadError> {
         let new = Arc::new(new);
-        let created = self.group.commit(Vec::new(), move |tx| {
+        let created = self.group.commit(move |tx| {
             let new = Arc::clone(&new);
             Box::pin(async move { insert_upload(tx, &new).await })
         });
-        created.await
+        let row = created.await?;
+        self.promised.grew();
+        Ok(row)
     }
 
     /// Adds an upload whose bytes are those of `parts`, in order; the parts stay.
@@ -199,6 +201,7 @@ impl Store {
         new.length = Some(length);
         let mut row = insert_upload(&mut tx, &new).await?;
         tx.commit().await?;
+        self.promised.grew();
         let id = upload_id(&row)?;
         let (target, sources) = (self.data.upload(id), parts.iter().map(|part| self.data.upload(*part)));
         let sources: Vec<PathBuf> = sources.collect();
@@ -231,13 +234,19 @@ impl Store {
     /// # Errors
     /// What the system or SQLite said.
     pub async fn save_upload(&self, row: &UploadRow, is_new: bool) -> Result<(), StoreError> {
-        let folders = if is_new { vec![self.data.uploads()] } else { Vec::new() };
+        if is_new {
+            let uploads = self.data.uploads();
+            tokio::task::spawn_blocking(move || atomic::sync_dir(&uploads)).await.map_err(io::Error::other)??;
+        }
         let row = Arc::new(row.clone());
-        let saved = self.group.commit(folders, move |tx| {
+        let saved = self.group.commit(move |tx| {
             let row = Arc::clone(&row);
-            Box::pin(async move { Ok(uploads::update(tx, &row).await?) })
+            Box::pin(async move { Ok::<_, StoreError>(uploads::update(tx, &row).await?) })
         });
-        saved.await
+        saved.await?;
+        // Its length may have been told just now.
+        self.promised.grew();
+        Ok(())
     }
 
     /// Puts a complete upload, whose bytes are durable, into its dataset and writes its row. Where the caller does not know the SHA-256
@@ -334,7 +343,15 @@ async fn insert_upload(tx: &mut SqliteConnection, new: &NewUpload) -> Result<Upl
             return Err(UploadError::Conflict(path.to_string()));
         }
     }
-    let row = UploadRow {
+    let row = upload_row(new);
+    uploads::insert(tx, &row).await?;
+    check_quota(tx, row.owner_token.as_deref(), &[Quantity::Bytes, Quantity::Images]).await?;
+    Ok(row)
+}
+
+/// The row of a new upload without bytes.
+pub(super) fn upload_row(new: &NewUpload) -> UploadRow {
+    UploadRow {
         id: Uuid::now_v7().to_string(),
         created_ms: now_ms(),
         expires_ms: new.expires_ms,
@@ -347,10 +364,7 @@ async fn insert_upload(tx: &mut SqliteConnection, new: &NewUpload) -> Result<Upl
         path: new.target.as_ref().map(|(_, path)| path.to_string()),
         stored: false,
         owner_token: new.owner_token.map(|token| token.to_string()),
-    };
-    uploads::insert(tx, &row).await?;
-    check_quota(tx, row.owner_token.as_deref(), &[Quantity::Bytes, Quantity::Images]).await?;
-    Ok(row)
+    }
 }
 
 /// The id of a row, which was written from one.

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::fs::File;
 use std::io;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -62,6 +63,35 @@ impl Reservations {
     }
 }
 
+/// Bytes that open uploads have announced and not sent yet. What the database said last is not too little until more is announced.
+#[derive(Debug, Default)]
+pub(super) struct Promised {
+    /// How often they grew.
+    growths: AtomicU64,
+    /// What the database said, and how often they had grown when it was asked.
+    known: Mutex<Option<(u64, u64)>>,
+}
+
+impl Promised {
+    /// To be called once the database knows of more.
+    pub(super) fn grew(&self) {
+        self.growths.fetch_add(1, Ordering::SeqCst);
+    }
+
+    /// As many at most; none when that is not known.
+    fn at_most(&self) -> Option<u64> {
+        let known = *self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        known.filter(|(_, growths)| *growths == self.growths.load(Ordering::SeqCst)).map(|(bytes, _)| bytes)
+    }
+
+    async fn ask(&self, db: &db::Db) -> sqlx::Result<u64> {
+        let growths = self.growths.load(Ordering::SeqCst);
+        let bytes = u64::try_from(db::uploads::outstanding_bytes(db.reader()).await?).unwrap_or(0);
+        *self.known.lock().unwrap_or_else(PoisonError::into_inner) = Some((bytes, growths));
+        Ok(bytes)
+    }
+}
+
 impl Store {
     /// Keeps room for what a job has still to write to its folders, until it is [released](Self::release_space).
     pub fn reserve_space(&self, job: Uuid, folders: Vec<PathBuf>, bytes: u64) {
@@ -107,8 +137,12 @@ impl Store {
     /// # Errors
     /// What the system or SQLite said.
     pub async fn free_bytes(&self) -> Result<u64, StoreError> {
-        let promised = db::uploads::outstanding_bytes(self.db.reader()).await?;
-        let taken = [RESERVE_BYTES, u64::try_from(promised).unwrap_or(0), self.reservations.outstanding_bytes()];
+        let promised = self.promised.ask(&self.db).await?;
+        Ok(self.free_beside(promised)?)
+    }
+
+    fn free_beside(&self, promised: u64) -> io::Result<u64> {
+        let taken = [RESERVE_BYTES, promised, self.reservations.outstanding_bytes()];
         Ok(taken.into_iter().fold(self.disk_free_bytes()?, u64::saturating_sub))
     }
 
@@ -117,6 +151,11 @@ impl Store {
     /// # Errors
     /// [`io::ErrorKind::StorageFull`], or what the system or SQLite said.
     pub async fn check_space(&self, bytes: u64) -> Result<(), StoreError> {
+        if let Some(promised) = self.promised.at_most()
+            && self.free_beside(promised)? >= bytes
+        {
+            return Ok(());
+        }
         if self.free_bytes().await? < bytes {
             return Err(io::Error::from(io::ErrorKind::StorageFull).into());
         }

@@ -144,13 +144,26 @@ impl Tus {
 
     /// Starts a PATCH of `length` bytes by hand, with nothing of its body sent yet.
     pub async fn begin_patch(&self, upload: &str, offset: u64, length: usize, headers: Headers<'_>) -> TcpStream {
-        let url = reqwest::Url::parse(upload).unwrap();
+        let offset = offset.to_string();
+        let mut all = vec![("upload-offset", offset.as_str())];
+        all.extend_from_slice(headers);
+        self.begin("PATCH", upload, length, &all).await
+    }
+
+    /// The same for a POST that makes an upload of these bytes.
+    pub async fn begin_post(&self, length: usize) -> TcpStream {
+        let (metadata, bytes) = (self.fresh_metadata(), length.to_string());
+        self.begin("POST", &self.endpoint, length, &[("upload-metadata", &metadata), ("upload-length", &bytes)]).await
+    }
+
+    async fn begin(&self, method: &str, address: &str, length: usize, headers: Headers<'_>) -> TcpStream {
+        let url = reqwest::Url::parse(address).unwrap();
         let host = format!("{}:{}", url.host_str().unwrap(), url.port_or_known_default().unwrap());
         let mut stream = TcpStream::connect(&host).await.unwrap();
         let more: String = headers.iter().map(|(name, value)| format!("{name}: {value}\r\n")).collect();
         let head = format!(
-            "PATCH {} HTTP/1.1\r\nhost: {host}\r\ntus-resumable: 1.0.0\r\ncontent-type: application/offset+octet-stream\r\n\
-             upload-offset: {offset}\r\ncontent-length: {length}\r\n{more}\r\n",
+            "{method} {} HTTP/1.1\r\nhost: {host}\r\ntus-resumable: 1.0.0\r\ncontent-type: application/offset+octet-stream\r\n\
+             content-length: {length}\r\n{more}\r\n",
             url.path()
         );
         stream.write_all(head.as_bytes()).await.unwrap();

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use crate::client::{Tus, pattern};
+use crate::client::{BYTES, Tus, pattern};
 use crate::service::{files_below, photographs};
 
 #[tokio::test(flavor = "multi_thread")]
@@ -79,6 +79,7 @@ async fn a_dataset_in_use_takes_the_photograph_later() {
     let job = service.post_json("/api/v1/jobs", &new).await.ok(202);
     service.wait_hanging(&job).await;
     tus.post(&[("upload-length", "5")], None).await.expect(409);
+    tus.post(&[("upload-length", "5"), BYTES], Some(b"hello")).await.expect(409);
     tus.patch(&upload, 0, b"hello").await.expect(409);
     // A sender that was told of all its bytes would think that all is well.
     tus.head(&upload).await.expect(409);

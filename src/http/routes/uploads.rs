@@ -17,7 +17,7 @@ use crate::http::AppState;
 use crate::http::access::Principal;
 use crate::http::extract::{UploadId, media_type};
 use crate::http::problem::{Code, Problem};
-use crate::http::tus::{self, Append, Checksum, Concat, Length, Target, UploadGuard};
+use crate::http::tus::{self, Append, Checksum, Concat, Length, Room, Target, UploadGuard};
 use crate::store::db::now_ms;
 use crate::store::db::tokens::Owned;
 use crate::store::db::uploads::UploadRow;
@@ -123,10 +123,18 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
         Length::Deferred => None,
     };
     check_length(&state, length)?;
-    state.jobs.store.check_space(length.unwrap_or(0)).await?;
+    let waiting_bytes = state.waiting.taken_bytes();
+    state.jobs.store.check_space(length.unwrap_or(0).saturating_add(waiting_bytes)).await?;
     new.length = length;
     let with_bytes = headers.get(header::CONTENT_TYPE).is_some() && media_type(&headers) == tus::MEDIA_TYPE;
     let checksum = if with_bytes { Checksum::of(&headers)? } else { None };
+    if with_bytes
+        && new.kind == UploadKind::Whole
+        && let Some(length) = length.filter(|length| announced_bytes(&headers) == i64::try_from(*length).ok())
+        && let Some(room) = state.waiting.enter(length)
+    {
+        return create_whole(&state, new, room, checksum, body).await;
+    }
     let mut row = state.jobs.store.create_upload(new).await?;
     if with_bytes {
         let id = parse_id(&row)?;
@@ -147,6 +155,26 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
         state.jobs.store.store_upload(&mut row, None).await?;
     }
     Ok(created(&row, with_bytes))
+}
+
+/// An upload whose bytes all come with it: it waits in memory and is made when they are there. Of one that breaks off nothing is kept,
+/// since its sender never learns an address.
+async fn create_whole(
+    state: &AppState,
+    new: NewUpload,
+    room: Room,
+    checksum: Option<Checksum>,
+    body: Body,
+) -> Result<Response, Problem> {
+    let file = room.fill(body, checksum, state.config.upload_idle_timeout).await?;
+    let row = state.jobs.store.store_whole(new, file).await?;
+    state.metrics.uploaded(u64::try_from(row.offset).unwrap_or(0), 1);
+    Ok(created(&row, true))
+}
+
+/// What the request says its body has.
+fn announced_bytes(headers: &HeaderMap) -> Option<i64> {
+    headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse().ok())
 }
 
 fn created(row: &UploadRow, with_bytes: bool) -> Response {
@@ -237,9 +265,7 @@ async fn bring(state: &AppState, id: Uuid, headers: &HeaderMap, body: Body) -> R
         }
         row.length = Some(length);
     }
-    let announced: Option<i64> =
-        headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse().ok());
-    if announced.zip(row.length).is_some_and(|(bytes, length)| bytes > length - row.offset) {
+    if announced_bytes(headers).zip(row.length).is_some_and(|(bytes, length)| bytes > length - row.offset) {
         return Err(Problem::new(Code::PayloadTooLarge).detail("the body goes beyond the upload's length"));
     }
     let (row, _guard) = receive(state, id, row, guard, checksum, body).await?;

@@ -1,12 +1,14 @@
-//! The tus 1.0.0 protocol of resumable uploads: its headers, its locks, and bytes on their way into an upload.
+//! The tus 1.0.0 protocol of resumable uploads: its headers, its locks, and bytes on their way into an upload or, whole, to the store.
 
 mod append;
 mod headers;
 mod locks;
+mod whole;
 
 pub(super) use append::{Append, append};
 pub(super) use headers::{Checksum, Concat, Length, Target, metadata, offset};
 pub(super) use locks::{UploadGuard, UploadLocks};
+pub(super) use whole::{Room, WaitingRoom};
 
 use axum::extract::Request;
 use axum::http::{HeaderName, HeaderValue, Method};

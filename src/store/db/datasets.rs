@@ -74,13 +74,15 @@ pub struct PlaceRow {
     pub sha256: Option<String>,
     /// Their number.
     pub size_bytes: Option<i64>,
+    /// Whose the dataset is.
+    pub owner_token: Option<String>,
 }
 
 /// A path of a dataset; none without such a dataset.
 pub async fn place(db: impl SqliteExecutor<'_>, id: Uuid, path: &str) -> sqlx::Result<Option<PlaceRow>> {
     sqlx::query_as(
-        "SELECT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id AND state IN ('queued', 'running')) AS in_use, i.sha256, i.size_bytes
-         FROM datasets d LEFT JOIN dataset_images i ON i.dataset_id = d.id AND i.path = ? WHERE d.id = ?",
+        "SELECT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id AND state IN ('queued', 'running')) AS in_use, i.sha256, i.size_bytes,
+         d.owner_token FROM datasets d LEFT JOIN dataset_images i ON i.dataset_id = d.id AND i.path = ? WHERE d.id = ?",
     )
     .bind(path)
     .bind(id.to_string())

@@ -27,7 +27,7 @@ use sqlx::migrate::Migrator;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Connection, SqlitePool};
 
-use write::{Stopwatch, WaitsFor, WriteFigures, WriteTimes, WriteTransaction};
+use write::{Stopwatch, WriteFigures, WriteTimes, WriteTransaction};
 
 static MIGRATIONS: Migrator = sqlx::migrate!("./migrations");
 
@@ -60,6 +60,8 @@ impl Db {
             .idle_timeout(None)
             .max_lifetime(None)
             .acquire_timeout(Duration::from_secs(60))
+            // There is no network in between that could have closed it.
+            .test_before_acquire(false)
             // A commit that fails, as on a full disk, may leave a connection that believes to be in a transaction which SQLite has
             // rolled back; it would refuse every further one.
             .after_release(|connection, _| {
@@ -74,6 +76,7 @@ impl Db {
         let reader = SqlitePoolOptions::new()
             .max_connections(READERS)
             .acquire_timeout(Duration::from_secs(60))
+            .test_before_acquire(false)
             .connect_with(options.read_only(true).create_if_missing(false))
             .await?;
         Ok(Self { reader, writer, times: Arc::default() })
@@ -89,7 +92,7 @@ impl Db {
     /// # Errors
     /// What SQLite said.
     pub async fn write(&self) -> Result<WriteTransaction, sqlx::Error> {
-        let stopwatch = Stopwatch::start(&self.times, WaitsFor::Commits);
+        let stopwatch = Stopwatch::start(&self.times);
         Ok(WriteTransaction { stopwatch: Some(stopwatch), ..self.write_untimed().await? })
     }
 

@@ -3,6 +3,9 @@
 use sqlx::{FromRow, SqliteConnection, SqliteExecutor};
 use uuid::Uuid;
 
+use super::dataset_images::DatasetImageRow;
+use super::datasets::PlaceRow;
+
 /// A resumable upload.
 #[derive(Clone, Debug, PartialEq, Eq, FromRow)]
 pub struct UploadRow {
@@ -53,6 +56,50 @@ pub async fn insert(db: &mut SqliteConnection, upload: &UploadRow) -> sqlx::Resu
     .execute(db)
     .await?;
     Ok(())
+}
+
+/// Adds an upload that is a photograph of its dataset already, and the photograph, all in one request to SQLite; gives what was known
+/// of the path before, and none without such a dataset. Where a photograph was known before, it stays.
+pub async fn insert_stored(
+    db: &mut SqliteConnection,
+    upload: &UploadRow,
+    image: &DatasetImageRow,
+    now_ms: i64,
+) -> sqlx::Result<Option<PlaceRow>> {
+    let dataset = &upload.dataset_id;
+    let rows = sqlx::query_as(
+        "SELECT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id AND state IN ('queued', 'running')) AS in_use, i.sha256, i.size_bytes,
+         d.owner_token FROM datasets d LEFT JOIN dataset_images i ON i.dataset_id = d.id AND i.path = ? WHERE d.id = ?;
+         INSERT INTO uploads (id, created_ms, expires_ms, kind, length, offset, metadata, concat, path, stored, owner_token, dataset_id)
+         SELECT ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, id FROM datasets WHERE id = ?;
+         INSERT INTO dataset_images (path, size_bytes, sha256, dataset_id)
+         SELECT ?, ?, ?, id FROM datasets WHERE id = ? ON CONFLICT DO NOTHING;
+         UPDATE datasets SET changed_ms = ? WHERE id = ?",
+    )
+    .bind(&image.path)
+    .bind(dataset)
+    .bind(&upload.id)
+    .bind(upload.created_ms)
+    .bind(upload.expires_ms)
+    .bind(&upload.kind)
+    .bind(upload.length)
+    .bind(upload.offset)
+    .bind(&upload.metadata)
+    .bind(&upload.concat)
+    .bind(&upload.path)
+    .bind(upload.stored)
+    .bind(&upload.owner_token)
+    .bind(dataset)
+    .bind(&image.path)
+    .bind(image.size_bytes)
+    .bind(&image.sha256)
+    .bind(dataset)
+    .bind(now_ms)
+    .bind(dataset)
+    // All statements run to their ends; only the first has a row.
+    .fetch_all(db)
+    .await?;
+    Ok(rows.into_iter().next())
 }
 
 /// One upload.

@@ -19,7 +19,7 @@ pub struct WriteFigures {
     pub counts: [u64; CLASSES_MS.len() + 1],
     /// Time of all writes from the request to the answer, syncs left out.
     pub time: Duration,
-    /// Time in which the disk was waited for.
+    /// Time in which a commit waited for the disk.
     pub syncs: Duration,
 }
 
@@ -78,33 +78,15 @@ impl SyncClock {
 #[derive(Debug, Default)]
 pub(in crate::store) struct WriteTimes {
     figures: Mutex<WriteFigures>,
-    /// Of commits alone, which every writer waits for.
+    /// Of commits, which every writer waits for.
     commits: SyncClock,
-    /// Of commits, and of folders that are synced for the commit after.
-    all: SyncClock,
-}
-
-/// Which syncs a write waits for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::store) enum WaitsFor {
-    /// Commits.
-    Commits,
-    /// Commits, and folders before them.
-    FoldersToo,
 }
 
 impl WriteTimes {
     /// What writes took so far.
     pub(in crate::store) fn figures(&self) -> WriteFigures {
         let figures = *self.figures.lock().unwrap_or_else(PoisonError::into_inner);
-        WriteFigures { syncs: self.all.read(), ..figures }
-    }
-
-    fn clock(&self, waits_for: WaitsFor) -> &SyncClock {
-        match waits_for {
-            WaitsFor::Commits => &self.commits,
-            WaitsFor::FoldersToo => &self.all,
-        }
+        WriteFigures { syncs: self.commits.read(), ..figures }
     }
 }
 
@@ -112,21 +94,19 @@ impl WriteTimes {
 #[derive(Debug)]
 pub(in crate::store) struct Stopwatch {
     times: Arc<WriteTimes>,
-    waits_for: WaitsFor,
     start: Instant,
     syncs: Duration,
 }
 
 impl Stopwatch {
-    pub(in crate::store) fn start(times: &Arc<WriteTimes>, waits_for: WaitsFor) -> Self {
-        let syncs = times.clock(waits_for).read();
-        Self { times: Arc::clone(times), waits_for, start: Instant::now(), syncs }
+    pub(in crate::store) fn start(times: &Arc<WriteTimes>) -> Self {
+        Self { times: Arc::clone(times), start: Instant::now(), syncs: times.commits.read() }
     }
 }
 
 impl Drop for Stopwatch {
     fn drop(&mut self) {
-        let syncs = self.times.clock(self.waits_for).read().saturating_sub(self.syncs);
+        let syncs = self.times.commits.read().saturating_sub(self.syncs);
         let time = self.start.elapsed().saturating_sub(syncs);
         let class = CLASSES_MS.iter().position(|end_ms| time <= Duration::from_millis(*end_ms));
         let mut figures = self.times.figures.lock().unwrap_or_else(PoisonError::into_inner);
@@ -135,32 +115,19 @@ impl Drop for Stopwatch {
     }
 }
 
-/// A sync under way, until it is dropped.
-pub(in crate::store) struct Syncing {
-    times: Arc<WriteTimes>,
-    is_commit: bool,
-}
+/// A commit that waits for the disk, until it is dropped.
+struct Syncing(Arc<WriteTimes>);
 
 impl Syncing {
-    pub(in crate::store) fn folders(times: &Arc<WriteTimes>) -> Self {
-        Self::start(times, false)
-    }
-
-    fn start(times: &Arc<WriteTimes>, is_commit: bool) -> Self {
-        times.all.start();
-        if is_commit {
-            times.commits.start();
-        }
-        Self { times: Arc::clone(times), is_commit }
+    fn start(times: &Arc<WriteTimes>) -> Self {
+        times.commits.start();
+        Self(Arc::clone(times))
     }
 }
 
 impl Drop for Syncing {
     fn drop(&mut self) {
-        self.times.all.stop();
-        if self.is_commit {
-            self.times.commits.stop();
-        }
+        self.0.commits.stop();
     }
 }
 
@@ -179,7 +146,7 @@ impl WriteTransaction {
     /// What SQLite said.
     pub async fn commit(self) -> sqlx::Result<()> {
         let Self { inner, times, stopwatch } = self;
-        let syncing = Syncing::start(&times, true);
+        let syncing = Syncing::start(&times);
         let committed = inner.commit().await;
         drop(syncing);
         drop(stopwatch);
@@ -218,23 +185,17 @@ mod tests {
     fn a_write_is_counted_without_the_syncs_that_it_waited_for() {
         let times = Arc::new(WriteTimes::default());
         let nap = |ms| std::thread::sleep(Duration::from_millis(ms));
-        for (waits_for, is_commit) in
-            [(WaitsFor::Commits, true), (WaitsFor::FoldersToo, true), (WaitsFor::FoldersToo, false)]
-        {
-            let stopwatch = Stopwatch::start(&times, waits_for);
-            let syncing = Syncing::start(&times, is_commit);
-            nap(300);
-            drop(syncing);
-            drop(stopwatch);
-        }
+        let stopwatch = Stopwatch::start(&times);
+        let syncing = Syncing::start(&times);
+        nap(300);
+        drop(syncing);
+        drop(stopwatch);
         let after = times.figures();
-        assert!(after.syncs >= Duration::from_millis(900) && after.time < Duration::from_millis(300), "{after:?}");
-        // Nobody but who waits for folders is spared their time.
-        let stopwatch = Stopwatch::start(&times, WaitsFor::Commits);
-        let syncing = Syncing::folders(&times);
+        assert!(after.syncs >= Duration::from_millis(300) && after.time < Duration::from_millis(300), "{after:?}");
+        // Whatever else it does is counted.
+        let stopwatch = Stopwatch::start(&times);
         nap(300);
         drop(stopwatch);
-        drop(syncing);
         assert!(times.figures().time - after.time >= Duration::from_millis(300));
     }
 
