@@ -1,9 +1,9 @@
 //! Many clients at once on the real program: uploads beside listeners on events, and thousands of photographs through tus.
 //!
 //! An ordinary run is short. Long ones, as for the README:
-//! `MULTISTAGE_LOAD_S=60 MULTISTAGE_LOAD_FILES=500 cargo test --locked --test load -- --nocapture --test-threads=1`; 10,000 photographs of 4 MiB
-//! need 40 GiB, `MULTISTAGE_LOAD_FILE_BYTES` makes them smaller. `MULTISTAGE_LOAD_ARCHIVE_BYTES` is the size of a job's outputs, which are sparse
-//! files.
+//! `MULTISTAGE_LOAD_S=60 MULTISTAGE_LOAD_FILES=500 cargo test --locked --test load -- --nocapture --test-threads=1`. Of the
+//! many photographs, 4 MiB each or `MULTISTAGE_LOAD_FILE_BYTES`, few are on the disk at a time. `MULTISTAGE_LOAD_ARCHIVE_BYTES` is the size of a
+//! job's outputs, which are sparse files.
 
 #![allow(clippy::unwrap_used)]
 
@@ -24,7 +24,7 @@ use multistage::store::db::job_outputs::{self, JobOutputRow};
 use multistage::store::db::jobs::{self, NewJobRow};
 use multistage::store::{DataDir, Db};
 use program::Program;
-use reqwest::{Client, Response};
+use reqwest::{Body, Client, Response};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
@@ -67,9 +67,15 @@ async fn dataset(http: &Client, base: &str) -> String {
 
 /// One photograph in one request of tus.
 async fn upload(http: &Client, base: &str, dataset: &str, path: &str, bytes: Vec<u8>) {
+    let size = bytes.len();
+    upload_body(http, base, dataset, path, size, bytes.into()).await;
+}
+
+async fn upload_body(http: &Client, base: &str, dataset: &str, path: &str, size: usize, body: Body) {
     let request = http.post(format!("{base}/api/v1/uploads")).header("tus-resumable", "1.0.0");
-    let request = request.header("upload-length", bytes.len()).header("upload-metadata", metadata(dataset, path));
-    expect(request.header("content-type", "application/offset+octet-stream").body(bytes), 201).await;
+    let request = request.header("upload-length", size).header("upload-metadata", metadata(dataset, path));
+    let request = request.header("content-type", "application/offset+octet-stream").header("content-length", size);
+    expect(request.body(body), 201).await;
 }
 
 /// The resident memory of a process.
