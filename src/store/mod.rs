@@ -19,6 +19,7 @@ mod resumable;
 mod space;
 mod token;
 mod whole;
+mod writable;
 
 use std::io;
 use std::path::Path;
@@ -44,6 +45,7 @@ pub use quota::{Quantity, Quota};
 pub use resumable::{Appended, Appender, NewUpload, UploadError, UploadKind};
 use space::{Promised, Reservations};
 pub use token::{Scope, create_token, find_token};
+use writable::Writable;
 
 /// The database and the files that belong to it.
 #[derive(Debug)]
@@ -56,6 +58,7 @@ pub struct Store {
     promised: Promised,
     group: GroupCommit,
     claims: Claims,
+    writable: Writable,
     folders: Arc<DurableFolders>,
     /// Held by whoever removes deleted folders.
     discarding: Mutex<()>,
@@ -138,6 +141,7 @@ impl Store {
             promised: Promised::default(),
             group,
             claims: Claims::default(),
+            writable: Writable::default(),
             folders: Arc::default(),
             discarding: Mutex::default(),
         })

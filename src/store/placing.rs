@@ -203,7 +203,7 @@ pub(super) fn check_place(place: Option<datasets::PlaceRow>) -> Result<datasets:
     }
 }
 
-async fn check_writable(db: &mut SqliteConnection, dataset: Uuid) -> Result<(), StoreError> {
+pub(super) async fn check_writable(db: &mut SqliteConnection, dataset: Uuid) -> Result<(), StoreError> {
     match datasets::in_use(db, dataset).await? {
         None => Err(StoreError::NotFound),
         Some(true) => Err(StoreError::DatasetInUse),

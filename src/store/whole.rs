@@ -15,7 +15,7 @@ use uuid::Uuid;
 use super::db::dataset_images::DatasetImageRow;
 use super::db::uploads::UploadRow;
 use super::db::{now_ms, uploads};
-use super::placing::{Moved, Note, check_place, find_place, image_row, move_error};
+use super::placing::{Moved, Note, check_place, image_row, move_error};
 use super::resumable::upload_row;
 use super::{ImagePath, NewUpload, Quantity, StagedFile, StagedWriter, Store, StoreError, UploadError, check_quota};
 
@@ -28,23 +28,24 @@ enum Written {
 }
 
 impl Store {
-    /// Adds an upload whose `bytes` are all there, as a photograph of its dataset; the bytes are dropped as soon as they are written.
+    /// Adds an upload whose bytes are all there, in `pieces`, as a photograph of its dataset; they are dropped as soon as they are written.
     ///
     /// # Errors
     /// [`UploadError::Conflict`], a dataset that takes nothing now, or what the store said; there is no upload then.
-    pub async fn store_whole<B>(self: &Arc<Self>, new: NewUpload, bytes: B) -> Result<UploadRow, UploadError>
+    pub async fn store_whole<P>(self: &Arc<Self>, new: NewUpload, pieces: Vec<P>) -> Result<UploadRow, UploadError>
     where
-        B: AsRef<[u8]> + Send + 'static,
+        P: AsRef<[u8]> + Send + 'static,
     {
         let (dataset, path) = new.target.clone().ok_or(UploadError::NotFound)?;
         let row = upload_row(&new);
-        let length = i64::try_from(bytes.as_ref().len()).unwrap_or(i64::MAX);
+        let length = pieces.iter().map(|piece| piece.as_ref().len()).sum::<usize>();
+        let length = i64::try_from(length).unwrap_or(i64::MAX);
         let row = UploadRow { length: Some(length), offset: length, stored: true, ..row };
         let store = Arc::clone(self);
         // In a task of its own: between the file and its row nothing may be given up.
         let storing = tokio::spawn(async move {
             let _claim = store.claims.take(dataset, [path.as_str().to_owned()].into()).await;
-            store.store_claimed(dataset, path, bytes, row).await
+            store.store_claimed(dataset, path, pieces, row).await
         });
         match storing.await.map_err(io::Error::other)? {
             Ok(row) => Ok(row),
@@ -53,26 +54,23 @@ impl Store {
         }
     }
 
-    async fn store_claimed<B>(
+    async fn store_claimed<P>(
         self: &Arc<Self>,
         dataset: Uuid,
         path: ImagePath,
-        bytes: B,
+        pieces: Vec<P>,
         row: UploadRow,
     ) -> Result<UploadRow, StoreError>
     where
-        B: AsRef<[u8]> + Send + 'static,
+        P: AsRef<[u8]> + Send + 'static,
     {
         // Nothing may appear, even for a moment, in the folder of a dataset that a job uses, nor a folder of none.
-        let there = find_place(&mut *self.db.reader().acquire().await?, dataset, path.as_str()).await?;
-        if there.size_bytes.is_some_and(|size_bytes| row.length != Some(size_bytes)) {
-            return Err(StoreError::FileConflict(path.to_string()));
-        }
+        self.writable.check(&self.db, dataset).await?;
         let target = self.data.images(dataset).join(path.as_str());
         let store = Arc::clone(self);
         let writing = tokio::task::spawn_blocking(move || {
             let mut moved = Moved::default();
-            (store.write_whole(path, target, bytes, &mut moved), moved)
+            (store.write_whole(path, target, pieces, &mut moved), moved)
         });
         let (written, moved) = writing.await.map_err(io::Error::other)?;
         let noted = match written {
@@ -96,17 +94,18 @@ impl Store {
         }
     }
 
-    /// Makes the bytes durable at `target` unless something lies there; notes in `moved` that they do. Blocking.
+    /// Makes the pieces durable at `target` unless something lies there; notes in `moved` that they do. Blocking.
     fn write_whole(
         &self,
         path: ImagePath,
         target: PathBuf,
-        bytes: impl AsRef<[u8]>,
+        pieces: Vec<impl AsRef<[u8]>>,
         moved: &mut Moved,
     ) -> Result<Written, StoreError> {
         let mut file = StagedWriter::create(&self.data.incoming())?;
-        file.write(bytes.as_ref())?;
-        drop(bytes);
+        for piece in pieces {
+            file.write(piece.as_ref())?;
+        }
         let file = file.finish(path.clone())?;
         let image = image_row(&file);
         let folder = target.parent().unwrap_or(&target);

@@ -57,8 +57,8 @@ async fn a_whole_photograph_is_stored_once_and_another_of_its_name_is_a_conflict
 
 #[tokio::test(flavor = "multi_thread")]
 async fn without_room_in_memory_photographs_are_written_as_they_come() {
-    const LENGTH: usize = 60_000;
-    let tus = Tus::start_own(|config| config.uploads.memory_bytes = 100_000).await;
+    const LENGTH: usize = 120_000;
+    let tus = Tus::start_own(|config| config.uploads.memory_bytes = 200_000).await;
     let written = || files_below(&tus.own.as_ref().unwrap().0.data_dir().join("uploads")).len();
     let bytes = pattern(LENGTH);
     let half = async || {

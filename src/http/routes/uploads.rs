@@ -166,8 +166,8 @@ async fn create_whole(
     checksum: Option<Checksum>,
     body: Body,
 ) -> Result<Response, Problem> {
-    let file = room.fill(body, checksum, state.config.upload_idle_timeout).await?;
-    let row = state.jobs.store.store_whole(new, file).await?;
+    let pieces = room.fill(body, checksum, state.config.upload_idle_timeout).await?;
+    let row = state.jobs.store.store_whole(new, pieces).await?;
     state.metrics.uploaded(u64::try_from(row.offset).unwrap_or(0), 1);
     Ok(created(&row, true))
 }

@@ -20,6 +20,7 @@ pub mod webhooks;
 pub mod write;
 
 use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -27,7 +28,7 @@ use sqlx::migrate::Migrator;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Connection, SqlitePool};
 
-use write::{Stopwatch, WriteFigures, WriteTimes, WriteTransaction};
+use write::{Change, Stopwatch, WriteFigures, WriteTimes, WriteTransaction};
 
 static MIGRATIONS: Migrator = sqlx::migrate!("./migrations");
 
@@ -40,6 +41,7 @@ pub struct Db {
     reader: SqlitePool,
     writer: SqlitePool,
     times: Arc<WriteTimes>,
+    changes: Arc<AtomicU64>,
 }
 
 impl Db {
@@ -79,7 +81,7 @@ impl Db {
             .test_before_acquire(false)
             .connect_with(options.read_only(true).create_if_missing(false))
             .await?;
-        Ok(Self { reader, writer, times: Arc::default() })
+        Ok(Self { reader, writer, times: Arc::default(), changes: Arc::default() })
     }
 
     /// For single reads.
@@ -93,16 +95,22 @@ impl Db {
     /// What SQLite said.
     pub async fn write(&self) -> Result<WriteTransaction, sqlx::Error> {
         let stopwatch = Stopwatch::start(&self.times);
-        Ok(WriteTransaction { stopwatch: Some(stopwatch), ..self.write_untimed().await? })
+        let change = Some(Change(Arc::clone(&self.changes)));
+        Ok(WriteTransaction { stopwatch: Some(stopwatch), change, ..self.write_untimed().await? })
     }
 
-    /// The same for whoever times what it does itself.
+    /// The same for whoever times what it does itself, and changes neither datasets nor jobs but for what is in them.
     ///
     /// # Errors
     /// What SQLite said.
     pub(in crate::store) async fn write_untimed(&self) -> Result<WriteTransaction, sqlx::Error> {
         let inner = self.writer.begin_with("BEGIN IMMEDIATE").await?;
-        Ok(WriteTransaction { inner, times: Arc::clone(&self.times), stopwatch: None })
+        Ok(WriteTransaction { inner, times: Arc::clone(&self.times), stopwatch: None, change: None })
+    }
+
+    /// Counts what this process commits besides photographs and uploads.
+    pub(in crate::store) fn changes(&self) -> u64 {
+        self.changes.load(Ordering::SeqCst)
     }
 
     /// What writes took since the start.

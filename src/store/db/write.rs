@@ -4,6 +4,7 @@
 //! which is ours. So the time of a write is counted without the time in which the writer waited for the disk.
 
 use std::ops::{Deref, DerefMut};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -137,6 +138,17 @@ pub struct WriteTransaction {
     pub(super) times: Arc<WriteTimes>,
     /// None where whoever asked is timed.
     pub(super) stopwatch: Option<Stopwatch>,
+    /// None for what does not count as a change.
+    pub(super) change: Option<Change>,
+}
+
+/// Counts when it is dropped, so also when nobody waited for the end of a commit.
+pub(super) struct Change(pub(super) Arc<AtomicU64>);
+
+impl Drop for Change {
+    fn drop(&mut self) {
+        self.0.fetch_add(1, Ordering::SeqCst);
+    }
 }
 
 impl WriteTransaction {
@@ -145,7 +157,7 @@ impl WriteTransaction {
     /// # Errors
     /// What SQLite said.
     pub async fn commit(self) -> sqlx::Result<()> {
-        let Self { inner, times, stopwatch } = self;
+        let Self { inner, times, stopwatch, change: _change } = self;
         let syncing = Syncing::start(&times);
         let committed = inner.commit().await;
         drop(syncing);
