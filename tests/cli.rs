@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod program;
+
 #[path = "cli/bad_pictures.rs"]
 mod bad_pictures;
 #[path = "cli/degenerate.rs"]

@@ -1,30 +1,18 @@
 //! The real program: stopped by a signal in the middle of a job, its log, and the figures of the service.
 
-use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+use crate::program::Program;
 use crate::service::{Service, file, photographs};
 
 /// After SIGTERM the process is gone within this time.
 const STOPPED: Duration = Duration::from_secs(10);
 
-fn serve(data_dir: &Path, log: std::fs::File) -> (Child, String) {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_multistage"))
-        .args(["serve", "--bind", "127.0.0.1:0", "--threads", "1", "--log-format", "json", "--data-dir"])
-        .arg(data_dir)
-        .env("RUST_LOG", "info")
-        .stdout(Stdio::piped())
-        .stderr(log)
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let base = line.trim().strip_prefix("listening on ").unwrap().trim_end_matches('/').to_owned();
-    (child, base)
+fn serve(data_dir: &Path, log: std::fs::File) -> Program {
+    Program::start_logging_at("info", data_dir, &["--threads", "1", "--log-format", "json"], log)
 }
 
 /// A photograph of noise, which has features everywhere and takes its time.
@@ -45,7 +33,8 @@ fn noise(seed: u32) -> Vec<u8> {
 async fn a_signal_stops_the_program_in_time_and_its_job_goes_on_after() {
     let folder = tempfile::tempdir().unwrap();
     let (data, log) = (folder.path().join("data"), folder.path().join("log"));
-    let (mut child, base) = serve(&data, std::fs::File::create(&log).unwrap());
+    let mut program = serve(&data, std::fs::File::create(&log).unwrap());
+    let base = program.base.clone();
     let form = (0..12)
         .fold(reqwest::multipart::Form::new(), |form, n| form.part("images", file(&format!("{n}.jpg"), &noise(n + 1))));
     let sent = reqwest::Client::new().post(format!("{base}/api/v1/jobs")).multipart(form).send().await.unwrap();
@@ -65,10 +54,10 @@ async fn a_signal_stops_the_program_in_time_and_its_job_goes_on_after() {
     let mut events = reqwest::get(format!("{base}{link}/events")).await.unwrap();
     assert!(events.chunk().await.unwrap().is_some());
     let asked = Instant::now();
-    let pid = rustix::process::Pid::from_child(&child);
+    let pid = rustix::process::Pid::from_raw(program.id() as i32).unwrap();
     rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
     let status = loop {
-        if let Some(status) = child.try_wait().unwrap() {
+        if let Some(status) = program.ended() {
             break status;
         }
         assert!(asked.elapsed() < STOPPED, "still there after {:?}", asked.elapsed());
@@ -84,17 +73,16 @@ async fn a_signal_stops_the_program_in_time_and_its_job_goes_on_after() {
     let id = link.rsplit('/').next().unwrap();
     assert!(lines.iter().any(|line| line["span"]["id"] == id && line["span"]["name"] == "job"), "{text}");
 
-    let (mut child, base) = serve(&data, std::fs::File::create(&log).unwrap());
+    let program = serve(&data, std::fs::File::create(&log).unwrap());
     let over = loop {
-        let now = job(&base).await;
+        let now = job(&program.base).await;
         if now["finished_at"].is_string() {
             break now;
         }
         assert!(start.elapsed() < Duration::from_secs(120), "{now:#}");
         tokio::time::sleep(Duration::from_millis(50)).await;
     };
-    child.kill().unwrap();
-    child.wait().unwrap();
+    program.kill();
     let reused = over["stages"][1]["counts"]["images_reused"].as_f64().unwrap();
     assert!(reused >= 2.0, "what was done before the signal is not done again: {over:#}");
     assert_eq!(over["error"]["code"], "no_model", "noise makes no model");

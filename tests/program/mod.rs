@@ -1,9 +1,10 @@
-//! The real program on a data directory of its own, to be killed.
+//! The real program on a data directory of its own, to be killed. Unless it is told otherwise, it listens on a free port of this machine, has
+//! two threads and logs errors alone.
 #![allow(dead_code, reason = "every test binary uses its own part")]
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 
 /// The running program; it ends with this value at the latest.
 pub struct Program {
@@ -30,13 +31,25 @@ impl Program {
         Self::start_as(Command::new(env!("CARGO_BIN_EXE_multistage")), data_dir, arguments, log)
     }
 
-    /// The same by another command, which ends with the program's name.
+    /// The same, with so much of it in the log as `level` says.
+    pub fn start_logging_at(level: &str, data_dir: &Path, arguments: &[&str], log: impl Into<Stdio>) -> Self {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_multistage"));
+        command.env("RUST_LOG", level);
+        Self::start_as(command, data_dir, arguments, log)
+    }
+
+    /// The same by another command, which ends with the program's name and may say what goes to the log.
     pub fn start_as(mut command: Command, data_dir: &Path, arguments: &[&str], log: impl Into<Stdio>) -> Self {
+        if !command.get_envs().any(|(name, _)| name == "RUST_LOG") {
+            command.env("RUST_LOG", "error");
+        }
         let mut child = command
-            .args(["serve", "--bind", "127.0.0.1:0", "--threads", "2", "--data-dir"])
+            // Arguments override these.
+            .env("MULTISTAGE_BIND", "127.0.0.1:0")
+            .env("MULTISTAGE_THREADS", "2")
+            .args(["serve", "--data-dir"])
             .arg(data_dir)
             .args(arguments)
-            .env("RUST_LOG", "error")
             .stderr(log)
             .stdout(Stdio::piped())
             .spawn()
@@ -62,6 +75,11 @@ impl Program {
     /// The process.
     pub fn id(&self) -> u32 {
         self.child.id()
+    }
+
+    /// How it ended, once it has.
+    pub fn ended(&mut self) -> Option<ExitStatus> {
+        self.child.try_wait().unwrap()
     }
 
     /// Waits until it has ended.
