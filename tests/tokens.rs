@@ -130,9 +130,8 @@ async fn no_token_is_in_the_log() {
     let said = String::from_utf8(create.output().unwrap().stdout).unwrap();
     let token = said.split_whitespace().find(|word| word.starts_with("msf_")).unwrap().to_owned();
     let wrong = format!("{}x", &token[..token.len() - 1]);
-    let mut verbose = Command::new("env");
-    verbose.args(["RUST_LOG=trace", env!("CARGO_BIN_EXE_multistage")]);
-    let program = Program::start_as(verbose, &data, &["--require-token"], std::fs::File::create(&log).unwrap());
+    let log_file = std::fs::File::create(&log).unwrap();
+    let program = Program::start_logging_at("trace", &data, &["--require-token"], log_file);
     let http = reqwest::Client::new();
     for (secret, right) in [(&token, true), (&wrong, false)] {
         let jobs = format!("{}/api/v1/jobs", program.base);

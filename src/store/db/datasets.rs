@@ -65,6 +65,16 @@ pub async fn in_use(db: impl SqliteExecutor<'_>, id: Uuid) -> sqlx::Result<Optio
     .await
 }
 
+/// Selects a [`PlaceRow`] by path and dataset.
+macro_rules! select_place {
+    () => {
+        "SELECT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id AND state IN ('queued', 'running')) AS in_use, i.sha256,
+         i.size_bytes, d.owner_token
+         FROM datasets d LEFT JOIN dataset_images i ON i.dataset_id = d.id AND i.path = ? WHERE d.id = ?"
+    };
+}
+pub(super) use select_place;
+
 /// What is known of a path before a photograph goes there.
 #[derive(Clone, Debug, PartialEq, Eq, FromRow)]
 pub struct PlaceRow {
@@ -80,14 +90,7 @@ pub struct PlaceRow {
 
 /// A path of a dataset; none without such a dataset.
 pub async fn place(db: impl SqliteExecutor<'_>, id: Uuid, path: &str) -> sqlx::Result<Option<PlaceRow>> {
-    sqlx::query_as(
-        "SELECT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id AND state IN ('queued', 'running')) AS in_use, i.sha256, i.size_bytes,
-         d.owner_token FROM datasets d LEFT JOIN dataset_images i ON i.dataset_id = d.id AND i.path = ? WHERE d.id = ?",
-    )
-    .bind(path)
-    .bind(id.to_string())
-    .fetch_optional(db)
-    .await
+    sqlx::query_as(select_place!()).bind(path).bind(id.to_string()).fetch_optional(db).await
 }
 
 /// Datasets older than the one with `seq` `before`, newest first, of one token or of all. One whose upload is not complete yet is

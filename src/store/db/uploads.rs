@@ -4,7 +4,7 @@ use sqlx::{FromRow, SqliteConnection, SqliteExecutor};
 use uuid::Uuid;
 
 use super::dataset_images::DatasetImageRow;
-use super::datasets::PlaceRow;
+use super::datasets::{PlaceRow, select_place};
 
 /// A resumable upload.
 #[derive(Clone, Debug, PartialEq, Eq, FromRow)]
@@ -35,26 +35,36 @@ pub struct UploadRow {
     pub owner_token: Option<String>,
 }
 
+/// Inserts a row of all columns, in the order in which [`bind_row`] binds them; what follows gives their values.
+macro_rules! insert_into_uploads {
+    () => {
+        "INSERT INTO uploads (id, created_ms, expires_ms, kind, length, offset, metadata, concat, dataset_id, path, stored, owner_token) "
+    };
+}
+
+/// Binds all columns of an upload, to whatever kind of query.
+macro_rules! bind_row {
+    ($query:expr, $upload:expr) => {
+        $query
+            .bind(&$upload.id)
+            .bind($upload.created_ms)
+            .bind($upload.expires_ms)
+            .bind(&$upload.kind)
+            .bind($upload.length)
+            .bind($upload.offset)
+            .bind(&$upload.metadata)
+            .bind(&$upload.concat)
+            .bind(&$upload.dataset_id)
+            .bind(&$upload.path)
+            .bind($upload.stored)
+            .bind(&$upload.owner_token)
+    };
+}
+
 /// Adds an upload.
 pub async fn insert(db: &mut SqliteConnection, upload: &UploadRow) -> sqlx::Result<()> {
-    sqlx::query(
-        "INSERT INTO uploads (id, created_ms, expires_ms, kind, length, offset, metadata, concat, dataset_id, path, stored,
-         owner_token) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-    )
-    .bind(&upload.id)
-    .bind(upload.created_ms)
-    .bind(upload.expires_ms)
-    .bind(&upload.kind)
-    .bind(upload.length)
-    .bind(upload.offset)
-    .bind(&upload.metadata)
-    .bind(&upload.concat)
-    .bind(&upload.dataset_id)
-    .bind(&upload.path)
-    .bind(upload.stored)
-    .bind(&upload.owner_token)
-    .execute(db)
-    .await?;
+    let query = sqlx::query(concat!(insert_into_uploads!(), "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"));
+    bind_row!(query, upload).execute(db).await?;
     Ok(())
 }
 
@@ -67,38 +77,26 @@ pub async fn insert_stored(
     now_ms: i64,
 ) -> sqlx::Result<Option<PlaceRow>> {
     let dataset = &upload.dataset_id;
-    let rows = sqlx::query_as(
-        "SELECT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = d.id AND state IN ('queued', 'running')) AS in_use, i.sha256, i.size_bytes,
-         d.owner_token FROM datasets d LEFT JOIN dataset_images i ON i.dataset_id = d.id AND i.path = ? WHERE d.id = ?;
-         INSERT INTO uploads (id, created_ms, expires_ms, kind, length, offset, metadata, concat, path, stored, owner_token, dataset_id)
-         SELECT ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, id FROM datasets WHERE id = ?;
+    let query = sqlx::query_as(concat!(
+        select_place!(),
+        ";",
+        insert_into_uploads!(),
+        "SELECT ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ? FROM datasets WHERE id = ?;
          INSERT INTO dataset_images (path, size_bytes, sha256, dataset_id)
          SELECT ?, ?, ?, id FROM datasets WHERE id = ? ON CONFLICT DO NOTHING;
          UPDATE datasets SET changed_ms = ? WHERE id = ?",
-    )
-    .bind(&image.path)
-    .bind(dataset)
-    .bind(&upload.id)
-    .bind(upload.created_ms)
-    .bind(upload.expires_ms)
-    .bind(&upload.kind)
-    .bind(upload.length)
-    .bind(upload.offset)
-    .bind(&upload.metadata)
-    .bind(&upload.concat)
-    .bind(&upload.path)
-    .bind(upload.stored)
-    .bind(&upload.owner_token)
-    .bind(dataset)
-    .bind(&image.path)
-    .bind(image.size_bytes)
-    .bind(&image.sha256)
-    .bind(dataset)
-    .bind(now_ms)
-    .bind(dataset)
-    // All statements run to their ends; only the first has a row.
-    .fetch_all(db)
-    .await?;
+    ));
+    let rows = bind_row!(query.bind(&image.path).bind(dataset), upload)
+        .bind(dataset)
+        .bind(&image.path)
+        .bind(image.size_bytes)
+        .bind(&image.sha256)
+        .bind(dataset)
+        .bind(now_ms)
+        .bind(dataset)
+        // All statements run to their ends; only the first has a row.
+        .fetch_all(db)
+        .await?;
     Ok(rows.into_iter().next())
 }
 
