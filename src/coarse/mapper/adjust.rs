@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::Mapper;
+use super::{Mapper, Unregistered};
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
 use crate::coarse::filter::filter;
 use crate::coarse::intrinsics::{enrich_cameras, free_intrinsics, merge_agreeing_cameras};
@@ -98,18 +98,22 @@ impl Mapper<'_> {
         filter(&mut self.model, &ids, &self.options.keep_limits())
     }
 
-    /// Takes out images that filtering left with too few points to hold their pose.
+    /// Takes out images that filtering left with too few points to hold their pose. Each time counts: one that is placed and
+    /// taken out over and over would keep the model growing and shrinking for ever.
     fn drop_unsupported(&mut self) {
-        let weak: Vec<ImageId> = self
+        let weak: Vec<(ImageId, usize)> = self
             .model
             .images()
             .iter()
-            .filter(|(_, image)| image.num_observations() < self.options.min_pose_inliers_relaxed)
-            .map(|(&id, _)| id)
+            .map(|(&id, image)| (id, image.num_observations()))
+            .filter(|&(_, observations)| observations < self.options.min_pose_inliers_relaxed)
             .collect();
-        for id in weak {
+        for (id, inliers) in weak {
             if self.model.images().len() > 2 {
                 self.model.deregister(id);
+                *self.drops.entry(id).or_insert(0) += 1;
+                let visible = self.visible_points(id).len();
+                self.failures.insert(id, Unregistered::PoseFailed { visible, inliers });
             }
         }
     }

@@ -176,6 +176,8 @@ pub(super) struct Mapper<'a> {
     /// The last point each track was given; it may have been filtered since.
     point_of_track: Vec<Option<Point3dId>>,
     trials: BTreeMap<ImageId, u32>,
+    /// How often each image was taken out again for lack of points.
+    drops: BTreeMap<ImageId, u32>,
     failures: BTreeMap<ImageId, Unregistered>,
     /// Whether no more images will be registered.
     is_whole: bool,
@@ -202,6 +204,7 @@ impl<'a> Mapper<'a> {
             model: empty_model(input),
             point_of_track: vec![None; tracks.tracks.len()],
             trials: BTreeMap::new(),
+            drops: BTreeMap::new(),
             failures: BTreeMap::new(),
             is_whole: false,
         }

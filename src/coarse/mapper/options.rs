@@ -32,7 +32,8 @@ pub struct MapperOptions {
     pub min_pose_inliers: usize,
     /// Fewest inliers of a pose accepted when nothing else can be registered any more.
     pub min_pose_inliers_relaxed: usize,
-    /// How often an image is tried before it is left out.
+    /// How often an image is tried before it is left out, between two adjustments, and how often it may be placed and lose its
+    /// points again before it is left out for good.
     pub max_registration_trials: u32,
     /// Robust pose estimation.
     pub pose: AbsolutePoseOptions,

@@ -29,7 +29,9 @@ impl Mapper<'_> {
     pub(super) fn register_next(&mut self, min_inliers: usize) -> Option<ImageId> {
         let mut ranking: Vec<(u64, ImageId)> = Vec::new();
         for &image in self.component {
-            let spent = self.trials.get(&image).copied().unwrap_or(0) >= self.options.max_registration_trials;
+            let is_spent =
+                |count: Option<&u32>| count.is_some_and(|count| *count >= self.options.max_registration_trials);
+            let spent = is_spent(self.trials.get(&image)) || is_spent(self.drops.get(&image));
             if self.model.image(image).is_some() || spent {
                 continue;
             }

@@ -91,3 +91,19 @@ fn images_of_one_zoom_share_one_camera() {
         assert_eq!(used.len(), 1, "{layout:?}: {:?}", focals_px(model));
     }
 }
+
+/// An image whose pose is found every time and that every adjustment takes out again: it is given up and the rest stands.
+#[test]
+fn an_image_that_never_holds_is_given_up() {
+    let options = SceneOptions { num_images: 16, num_points: 1500, pixel_noise_px: 0.5, ..SceneOptions::default() };
+    let mut scene = generate(&options);
+    let weak = *scene.truth.images().keys().last().unwrap();
+    for (&(a, b), matches) in &mut scene.matches {
+        matches.retain(|found| (a != weak || found.0.0 < 40) && (b != weak || found.1.0 < 40));
+    }
+    let input = without_exif(&scene, &options, options.focal_px);
+    let mapper = MapperOptions { min_pose_inliers_relaxed: 60, ..MapperOptions::default() };
+    let models = reconstruct(&input, &mapper, 1, &|| true, &|_| ());
+    assert_eq!(models.models[0].images().len(), 15);
+    assert!(matches!(models.unregistered[&weak], Unregistered::PoseFailed { .. }), "{:?}", models.unregistered);
+}
