@@ -27,7 +27,10 @@ fn main() -> anyhow::Result<()> {
                 options.small_image_features = options.max_features;
             }
             "--first-octave" => options.first_octave = value.parse()?,
-            "--peak" => options.peak_threshold = value.parse()?,
+            "--peak" => {
+                options.peak_threshold = value.parse()?;
+                options.faint_threshold = options.faint_threshold.min(options.peak_threshold);
+            }
             "--edge" => options.edge_threshold = value.parse()?,
             "--sigma0" => options.sigma0 = value.parse()?,
             "--camera-sigma" => options.camera_sigma_px = value.parse()?,

@@ -1,25 +1,50 @@
-//! Gathers features while they are found and keeps those of the largest scales.
+//! Gathers features while they are found and keeps those of the largest scales: first the distinct ones, then, where these are
+//! few, faint ones.
 
-use std::cmp::Reverse;
+use std::cmp::{Ordering, Reverse};
 use std::collections::BinaryHeap;
 
 use crate::scene::{Descriptor, Features, Keypoint};
 
-/// Keeps the features of the `limit` largest scales among those at accepted places.
+/// How well a feature stands out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Class {
+    /// Its contrast is above the threshold.
+    Distinct,
+    /// Its contrast is below: taken to make up the number only.
+    Faint,
+}
+
+/// Keeps the `limit` distinct features of the largest scales among those at accepted places, and so many faint ones, likewise,
+/// as make up `faint_up_to`.
 #[derive(Clone)]
 pub(super) struct Collector<'a> {
     limit: usize,
+    faint_up_to: usize,
     /// Whether a feature at a pixel of the original image may be kept.
     keeps: &'a dyn Fn(f32, f32) -> bool,
-    /// The largest scales so far, smallest first. Positive floats sort as their bits do.
-    scales: BinaryHeap<Reverse<u32>>,
-    found: Vec<(Keypoint, Descriptor)>,
+    /// The largest scales of each class so far, smallest first. Positive floats sort as their bits do.
+    scales: [BinaryHeap<Reverse<u32>>; 2],
+    found: Vec<(Class, Keypoint, Descriptor)>,
 }
 
 impl<'a> Collector<'a> {
-    /// Keeps `limit` features at places that `keeps` accepts.
-    pub(super) fn new(limit: usize, keeps: &'a dyn Fn(f32, f32) -> bool) -> Self {
-        Self { limit, keeps, scales: BinaryHeap::new(), found: Vec::new() }
+    /// Keeps so many features at places that `keeps` accepts.
+    pub(super) fn new(limit: usize, faint_up_to: usize, keeps: &'a dyn Fn(f32, f32) -> bool) -> Self {
+        Self { limit, faint_up_to, keeps, scales: Default::default(), found: Vec::new() }
+    }
+
+    /// Features of a class that are kept at most, given the distinct ones so far.
+    fn room(&self, class: Class) -> usize {
+        match class {
+            Class::Distinct => self.limit,
+            Class::Faint => self.faint_up_to.saturating_sub(self.scales[Class::Distinct as usize].len()),
+        }
+    }
+
+    /// Whether any faint feature could still be kept.
+    pub(super) fn has_room_for_faint(&self) -> bool {
+        self.room(Class::Faint) > 0
     }
 
     /// Whether a feature at this pixel may be kept at all.
@@ -28,46 +53,58 @@ impl<'a> Collector<'a> {
     }
 
     /// Whether a feature of this scale could still be among those kept, so that describing it is worth while.
-    pub(super) fn wants(&self, scale: f32) -> bool {
-        self.scales.len() < self.limit || self.scales.peek().is_some_and(|least| scale.to_bits() >= least.0)
+    pub(super) fn wants(&self, class: Class, scale: f32) -> bool {
+        let (scales, room) = (&self.scales[class as usize], self.room(class));
+        scales.len() < room || (room > 0 && scales.peek().is_some_and(|least| scale.to_bits() >= least.0))
     }
 
-    /// Whether all places are taken by features of at least this scale.
-    pub(super) fn is_full_from(&self, scale: f32) -> bool {
-        self.scales.len() == self.limit && self.scales.peek().is_some_and(|least| least.0 >= scale.to_bits())
+    /// Whether all places of a class are taken by features of at least this scale.
+    pub(super) fn is_full_from(&self, class: Class, scale: f32) -> bool {
+        let (scales, room) = (&self.scales[class as usize], self.room(class));
+        scales.len() == room && scales.peek().is_none_or(|least| least.0 >= scale.to_bits())
     }
 
-    /// The keypoints found so far.
-    pub(super) fn keypoints(&self) -> impl Iterator<Item = Keypoint> {
-        self.found.iter().map(|(keypoint, _)| *keypoint)
+    /// The keypoints of a class found so far.
+    pub(super) fn keypoints(&self, class: Class) -> impl Iterator<Item = Keypoint> {
+        self.found.iter().filter(move |found| found.0 == class).map(|found| found.1)
     }
 
     /// Takes a feature.
-    pub(super) fn push(&mut self, keypoint: Keypoint, descriptor: Descriptor) {
-        self.scales.push(Reverse(keypoint.scale.to_bits()));
-        if self.scales.len() > self.limit {
-            self.scales.pop();
+    pub(super) fn push(&mut self, class: Class, keypoint: Keypoint, descriptor: Descriptor) {
+        self.scales[class as usize].push(Reverse(keypoint.scale.to_bits()));
+        for outgrown in [Class::Distinct, Class::Faint] {
+            while self.scales[outgrown as usize].len() > self.room(outgrown) {
+                self.scales[outgrown as usize].pop();
+            }
         }
-        self.found.push((keypoint, descriptor));
+        self.found.push((class, keypoint, descriptor));
         // Dropping the outgrown ones now and then bounds memory; doubling makes it cheap.
         if self.found.len() >= 2 * self.limit + 1024 {
-            let least = self.scales.peek().map_or(0, |least| least.0);
-            self.found.retain(|(keypoint, _)| keypoint.scale.to_bits() >= least);
+            let least = self.scales.each_ref().map(|scales| scales.peek().map_or(u32::MAX, |least| least.0));
+            self.found.retain(|(class, keypoint, _)| keypoint.scale.to_bits() >= least[*class as usize]);
         }
     }
 
     /// The kept features, sorted. Two extrema that were refined to the same place count once.
     pub(super) fn finish(mut self) -> Features {
-        let order = |a: &Keypoint, b: &Keypoint| {
-            (b.scale.total_cmp(&a.scale))
-                .then(a.y.total_cmp(&b.y))
-                .then(a.x.total_cmp(&b.x))
-                .then(a.orientation.total_cmp(&b.orientation))
-        };
-        self.found.sort_by(|(a, _), (b, _)| order(a, b));
-        self.found.dedup_by(|(a, _), (b, _)| a == b);
+        self.found.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| by_scale(&a.1, &b.1)));
+        self.found.dedup_by(|a, b| a.1 == b.1);
+        let distinct = self.found.partition_point(|found| found.0 == Class::Distinct);
+        let faint: Vec<_> = self.found.split_off(distinct);
         self.found.truncate(self.limit);
-        let (keypoints, descriptors) = self.found.into_iter().unzip();
+        let room = self.faint_up_to.saturating_sub(self.found.len());
+        self.found.extend(faint.into_iter().take(room));
+        self.found.sort_by(|a, b| by_scale(&a.1, &b.1));
+        let (keypoints, descriptors) =
+            self.found.into_iter().map(|(_, keypoint, descriptor)| (keypoint, descriptor)).unzip();
         Features { keypoints, descriptors }
     }
+}
+
+/// Larger scales first; the rest makes the order whole.
+fn by_scale(a: &Keypoint, b: &Keypoint) -> Ordering {
+    (b.scale.total_cmp(&a.scale))
+        .then(a.y.total_cmp(&b.y))
+        .then(a.x.total_cmp(&b.x))
+        .then(a.orientation.total_cmp(&b.orientation))
 }

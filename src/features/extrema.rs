@@ -44,6 +44,8 @@ pub(super) struct Extremum {
     pub(super) level: f32,
     /// The Gaussian level to describe it at.
     pub(super) s: usize,
+    /// Absolute difference of Gaussians there.
+    pub(super) contrast: f32,
 }
 
 stamp!(
@@ -58,20 +60,21 @@ fn subtract_body<const FMA: bool>(a: &[f32], b: &[f32], out: &mut [f32]) {
     }
 }
 
-/// Adds the columns of row `y` whose value in the middle of three differences is an extremum of its 27.
+/// Adds the columns of row `y` whose value in the middle of three differences is an extremum of its 27 that may have a
+/// contrast of `least`.
 pub(super) fn scan_row(
     isa: super::simd::Isa,
     differences: &[Ring],
     y: usize,
     width: usize,
-    options: &SiftOptions,
+    least: f32,
     found: &mut Vec<usize>,
 ) {
     let row = |s: usize, y: usize| differences[s].row(y);
     // Of equal neighbours exactly one counts as the extremum: the last.
     let strict = [row(0, y - 1), row(0, y), row(0, y + 1), row(1, y - 1)];
     let lax = [row(1, y + 1), row(2, y - 1), row(2, y), row(2, y + 1)];
-    scan(isa, row(1, y), &strict, &lax, width, GRID_PART * options.peak_threshold, found);
+    scan(isa, row(1, y), &strict, &lax, width, GRID_PART * least, found);
 }
 
 stamp!(
@@ -172,9 +175,14 @@ fn extremum_lanes(
 }
 
 /// Refines the grid extremum in column `x`, row `y` of difference `s`; none when the fit wanders off, the contrast is
-/// below the threshold or the curvatures are those of an edge.
-pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &SiftOptions) -> Option<Extremum> {
-    let (mut x, mut y, mut s, first_y) = (x, y, s, y);
+/// below `least` or the curvatures are those of an edge.
+pub(super) fn refine(
+    levels: &Levels,
+    (mut x, mut y, mut s): (usize, usize, usize),
+    least: f32,
+    options: &SiftOptions,
+) -> Option<Extremum> {
+    let first_y = y;
     for fit in 1..=MAX_FITS {
         let cube = neighbourhood::<3>(levels, x, y, s);
         let at = |dx: usize, dy: usize, ds: usize| cube[ds][dy][dx];
@@ -194,17 +202,16 @@ pub(super) fn refine(levels: &Levels, x: usize, y: usize, s: usize, options: &Si
             return None;
         }
         if offset.amax() <= if fit < MAX_FITS { MOVE_OFFSET } else { MAX_OFFSET } {
-            let contrast = value + 0.5 * gradient.dot(&offset);
+            let contrast = (value + 0.5 * gradient.dot(&offset)).abs();
             let (trace, determinant) = (xx + yy, xx * yy - xy * xy);
             let edge = options.edge_threshold;
-            let keeps =
-                contrast.abs() > options.peak_threshold && trace * trace * edge < (edge + 1.0).powi(2) * determinant;
+            let keeps = contrast > least && trace * trace * edge < (edge + 1.0).powi(2) * determinant;
             if !keeps {
                 return None;
             }
             let offset = settle(levels, (x, y, s), &inverse, offset);
             let (fx, fy, level) = (x as f32 + offset.x, y as f32 + offset.y, s as f32 + offset.z);
-            return Some(Extremum { x: fx, y: fy, level, s });
+            return Some(Extremum { x: fx, y: fy, level, s, contrast });
         }
         x = step(x, offset.x, 1, levels.width - 2)?;
         y = step(y, offset.y, 1, levels.height - 2)?;

@@ -9,6 +9,7 @@
 
 use std::collections::BTreeMap;
 
+use super::collector::Class;
 use crate::scene::Keypoint;
 
 /// Features promised for each one that is kept: room for errors of the forecast.
@@ -22,10 +23,17 @@ const BIN_SHIFT: u32 = 17;
 
 /// See the module.
 pub(super) struct Forecast {
-    wanted: f32,
+    /// Features described for those kept: the distinct ones, and both together where faint ones make up a number.
+    wanted: [f32; 2],
     /// Rows of the coarser octaves' features in original pixels, ascending.
     rows_px: Vec<f32>,
-    /// Their scales, ascending.
+    /// What is known of each class.
+    classes: [ClassSoFar; 2],
+}
+
+/// What is known of the features of a class.
+struct ClassSoFar {
+    /// Scales in the coarser octaves, ascending.
     scales: Vec<f32>,
     /// Extrema seen so far, by the bin of their scale.
     seen: BTreeMap<u32, usize>,
@@ -34,19 +42,37 @@ pub(super) struct Forecast {
 }
 
 impl Forecast {
-    /// From the features of the coarser octaves, when `wanted` features will be kept in all.
-    pub(super) fn new(coarser: impl Iterator<Item = Keypoint>, wanted: usize) -> Self {
-        let (mut rows_px, mut scales): (Vec<f32>, Vec<f32>) = coarser.map(|found| (found.y, found.scale)).unzip();
+    /// From the features of the coarser octaves, when `limit` distinct features will be kept in all, and with faint ones
+    /// `faint_up_to`.
+    pub(super) fn new<I: Iterator<Item = Keypoint>>(
+        coarser: impl Fn(Class) -> I,
+        limit: usize,
+        faint_up_to: usize,
+    ) -> Self {
+        let mut rows_px: Vec<f32> = Vec::new();
+        let classes = [Class::Distinct, Class::Faint].map(|class| {
+            let mut scales: Vec<f32> = Vec::new();
+            for found in coarser(class) {
+                rows_px.push(found.y);
+                scales.push(found.scale);
+            }
+            scales.sort_by(f32::total_cmp);
+            ClassSoFar { scales, seen: BTreeMap::new(), limit: 0.0, highest_limit: 0.0 }
+        });
         rows_px.sort_by(f32::total_cmp);
-        scales.sort_by(f32::total_cmp);
-        let wanted = MARGIN * wanted as f32;
-        Self { wanted, rows_px, scales, seen: BTreeMap::new(), limit: 0.0, highest_limit: 0.0 }
+        Self { wanted: [limit, faint_up_to].map(|wanted| MARGIN * wanted as f32), rows_px, classes }
     }
 
     /// Counts an extremum of this scale; whether it is worth describing.
-    pub(super) fn wants(&mut self, scale: f32) -> bool {
-        *self.seen.entry(scale.to_bits() >> BIN_SHIFT).or_insert(0) += 1;
-        scale >= self.limit
+    pub(super) fn wants(&mut self, class: Class, scale: f32) -> bool {
+        let so_far = &mut self.classes[class as usize];
+        *so_far.seen.entry(scale.to_bits() >> BIN_SHIFT).or_insert(0) += 1;
+        scale >= so_far.limit
+    }
+
+    /// Whether distinct features alone don't promise all that will be kept.
+    pub(super) fn has_room_for_faint(&self) -> bool {
+        self.classes[Class::Faint as usize].limit < f32::INFINITY
     }
 
     /// Row `y` of the octave, whose pixels are `step_px` original ones, is done.
@@ -56,27 +82,43 @@ impl Forecast {
         }
         let above = self.rows_px.partition_point(|&row| row < y as f32 * step_px);
         let share = above as f32 / self.rows_px.len() as f32;
-        self.limit = if share < MIN_SHARE { 0.0 } else { self.promising(share) };
+        if share < MIN_SHARE {
+            return;
+        }
+        let [distinct, faint] = &mut self.classes;
+        distinct.set_limit(share, self.wanted[Class::Distinct as usize]);
+        faint.set_limit(share, self.wanted[Class::Faint as usize] - distinct.promised(share));
+    }
+
+    /// Everything of a class from this scale on was described.
+    pub(super) fn complete_from(&self, class: Class) -> f32 {
+        self.classes[class as usize].highest_limit
+    }
+}
+
+impl ClassSoFar {
+    /// The number there will be in all.
+    fn promised(&self, share: f32) -> f32 {
+        self.scales.len() as f32 + self.seen.values().sum::<usize>() as f32 / share
+    }
+
+    /// The limit becomes the largest scale from which on `wanted` are promised; 0 when there is none.
+    fn set_limit(&mut self, share: f32, wanted: f32) {
+        self.limit = if wanted <= 0.0 { f32::INFINITY } else { self.promising(share, wanted) };
         self.highest_limit = self.highest_limit.max(self.limit);
     }
 
-    /// The largest scale from which on enough features are promised; 0 when there is none.
-    fn promising(&self, share: f32) -> f32 {
+    fn promising(&self, share: f32, wanted: f32) -> f32 {
         let mut seen = 0;
         for (bin, count) in self.seen.iter().rev() {
             seen += count;
             let scale = f32::from_bits(bin << BIN_SHIFT);
             let coarser = self.scales.len() - self.scales.partition_point(|&other| other < scale);
-            if coarser as f32 + seen as f32 / share >= self.wanted {
+            if coarser as f32 + seen as f32 / share >= wanted {
                 return scale;
             }
         }
         0.0
-    }
-
-    /// Everything from this scale on was described.
-    pub(super) fn complete_from(&self) -> f32 {
-        self.highest_limit
     }
 }
 
@@ -88,33 +130,59 @@ mod tests {
         Keypoint { x: 0.0, y, scale, orientation: 0.0 }
     }
 
+    /// Coarser octaves with distinct features only.
+    fn distinct(found: impl IntoIterator<Item = Keypoint>) -> impl Fn(Class) -> std::vec::IntoIter<Keypoint> {
+        let found: Vec<Keypoint> = found.into_iter().collect();
+        move |class| if class == Class::Distinct { found.clone() } else { Vec::new() }.into_iter()
+    }
+
     #[test]
     fn the_limit_leaves_the_promised_number() {
         // 100 coarser features spread evenly; the octave has ten extrema a row, of scales from 1 to 2.
-        let coarser = (0..100).map(|i| keypoint(i as f32, 3.0));
-        let mut forecast = Forecast::new(coarser, 500);
+        let mut forecast = Forecast::new(distinct((0..100).map(|i| keypoint(i as f32, 3.0))), 500, 0);
         let mut wanted = 0;
         for y in 0..200 {
             for i in 0..10 {
                 let scale = 1.0 + 0.1 * i as f32 + 0.0004 * y as f32;
-                wanted += usize::from(forecast.wants(scale));
+                wanted += usize::from(forecast.wants(Class::Distinct, scale));
             }
             forecast.finish_row(y, 0.5);
         }
         // All 320 down to the first forecast, then the three of each row that make the 475 promised with the margin.
         assert!((320 + 2 * 168..320 + 4 * 168).contains(&wanted), "{wanted}");
-        assert!((1.6..1.9).contains(&forecast.complete_from()), "{}", forecast.complete_from());
+        assert!(
+            (1.6..1.9).contains(&forecast.complete_from(Class::Distinct)),
+            "{}",
+            forecast.complete_from(Class::Distinct)
+        );
     }
 
     #[test]
     fn nothing_is_refused_while_little_is_known() {
-        let mut none = Forecast::new(std::iter::empty(), 1);
-        let mut late = Forecast::new((0..50).map(|i| keypoint(90.0 + 0.1 * i as f32, 3.0)), 60);
+        let mut none = Forecast::new(distinct([]), 1, 1);
+        let mut late = Forecast::new(distinct((0..50).map(|i| keypoint(90.0 + 0.1 * i as f32, 3.0))), 60, 60);
         for y in 0..160 {
-            assert!(none.wants(1.0) && late.wants(1.0), "row {y}");
+            assert!(none.wants(Class::Distinct, 1.0) && late.wants(Class::Faint, 1.0), "row {y}");
             none.finish_row(y, 0.5);
             late.finish_row(y, 0.5);
         }
-        assert_eq!((none.complete_from(), late.complete_from()), (0.0, 0.0));
+        for class in [Class::Distinct, Class::Faint] {
+            assert_eq!((none.complete_from(class), late.complete_from(class)), (0.0, 0.0));
+        }
+    }
+
+    #[test]
+    fn faint_ones_are_refused_once_distinct_ones_make_up_the_number() {
+        for (faint_up_to, is_refused) in [(900, true), (3000, false)] {
+            let mut forecast = Forecast::new(distinct((0..100).map(|i| keypoint(i as f32, 3.0))), 10_000, faint_up_to);
+            for y in 0..=INTERVAL {
+                for _ in 0..10 {
+                    forecast.wants(Class::Distinct, 1.0);
+                }
+                forecast.finish_row(y, 0.5);
+            }
+            assert_eq!(!forecast.has_room_for_faint(), is_refused, "{faint_up_to}");
+            assert_eq!(forecast.complete_from(Class::Faint) > 0.0, is_refused, "{faint_up_to}");
+        }
     }
 }

@@ -37,7 +37,7 @@ mod tests;
 pub use options::SiftOptions;
 
 use crate::scene::{Features, GrayImage};
-use collector::Collector;
+use collector::{Class, Collector};
 use forecast::Forecast;
 use octave::Octave;
 use simd::Isa;
@@ -50,7 +50,8 @@ const MIN_OCTAVE_SIDE: usize = 8;
 /// foretell what is worth describing in it; making their first level then costs its first blurs twice.
 const OCTAVE_0_DENSITY: f64 = 0.006;
 
-/// The SIFT features of an image, at most [`SiftOptions::limit`] and those of the largest scales.
+/// The SIFT features of an image: at most [`SiftOptions::limit`] distinct ones, those of the largest scales, and where there are
+/// fewer than [`SiftOptions::faint_up_to`], so many with faint ones.
 ///
 /// Images too small to hold a keypoint give no features. The result depends on nothing but the input and the machine's
 /// instruction set.
@@ -65,7 +66,8 @@ pub fn extract_where(image: &GrayImage, options: &SiftOptions, keeps: &dyn Fn(f3
 
 fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions, keeps: &dyn Fn(f32, f32) -> bool) -> Features {
     let limit = options.limit(image.width, image.height);
-    let mut collector = Collector::new(limit, keeps);
+    let faint_up_to = options.faint_up_to.min(limit);
+    let mut collector = Collector::new(limit, faint_up_to, keeps);
     if image.width == 0 || image.height == 0 || limit == 0 {
         return collector.finish();
     }
@@ -82,21 +84,26 @@ fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions, keeps: &dyn 
         seed = Some(Octave::new(isa, Source::seed(plane), octave_index, options).run(&mut collector, None));
     }
     if has_octave_0 && crowded {
-        run_foretold(octave_0, &mut collector, limit);
+        run_foretold(octave_0, &mut collector, limit, faint_up_to);
     }
     let doubled = options.first_octave < 0 && 2 * image.width.min(image.height) >= MIN_OCTAVE_SIDE;
-    if doubled && collector.wants(Octave::max_scale_px(-1, options)) {
-        run_foretold(|| Octave::new(isa, Source::doubled(image, options), -1, options), &mut collector, limit);
+    if doubled && collector.wants(Class::Distinct, Octave::max_scale_px(-1, options)) {
+        let octave = || Octave::new(isa, Source::doubled(image, options), -1, options);
+        run_foretold(octave, &mut collector, limit, faint_up_to);
     }
     collector.finish()
 }
 
 /// Runs an octave with a forecast from the coarser ones, and again without one where that kept too few.
-fn run_foretold<'a>(octave: impl Fn() -> Octave<'a>, collector: &mut Collector<'_>, limit: usize) {
+fn run_foretold<'a>(octave: impl Fn() -> Octave<'a>, collector: &mut Collector<'_>, limit: usize, faint_up_to: usize) {
     let before = collector.clone();
-    let mut forecast = Forecast::new(collector.keypoints(), limit);
+    let mut forecast = Forecast::new(|class| collector.keypoints(class), limit, faint_up_to);
     octave().run(collector, Some(&mut forecast));
-    if forecast.complete_from() > 0.0 && !collector.is_full_from(forecast.complete_from()) {
+    let is_wrong = [Class::Distinct, Class::Faint].into_iter().any(|class| {
+        let complete_from = forecast.complete_from(class);
+        complete_from > 0.0 && !collector.is_full_from(class, complete_from)
+    });
+    if is_wrong {
         *collector = before;
         octave().run(collector, None);
     }

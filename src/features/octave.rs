@@ -6,7 +6,7 @@
 //! each is oriented and described at once, for which the rings reach far enough up and down.
 
 use super::blur::{BATCH, Kernel, Scratch, blur_rows};
-use super::collector::Collector;
+use super::collector::{Class, Collector};
 use super::descriptor::{self, Describer};
 use super::extrema::{self, Extremum, MAX_ROW_STEPS};
 use super::forecast::Forecast;
@@ -124,15 +124,20 @@ impl<'a> Octave<'a> {
                 continue;
             }
             extrema.clear();
+            let takes_faint =
+                collector.has_room_for_faint() && forecast.as_ref().is_none_or(|told| told.has_room_for_faint());
+            let least = if takes_faint { self.options.faint_threshold } else { self.options.peak_threshold };
             for s in 1..=per_octave {
                 candidates.clear();
-                extrema::scan_row(self.isa, &differences[s - 1..=s + 1], y - 1, width, self.options, &mut candidates);
-                let refined = candidates.iter().map(|&x| extrema::refine(&self.levels, x, y - 1, s, self.options));
+                extrema::scan_row(self.isa, &differences[s - 1..=s + 1], y - 1, width, least, &mut candidates);
+                let refined =
+                    candidates.iter().map(|&x| extrema::refine(&self.levels, (x, y - 1, s), least, self.options));
                 extrema.extend(refined.flatten().filter(|extremum| {
                     let (scale, (x, y)) = (self.scale_px(extremum), self.place_px(extremum));
+                    let class = self.class(extremum);
                     collector.wants_at(x, y)
-                        && forecast.as_mut().is_none_or(|forecast| forecast.wants(scale))
-                        && collector.wants(scale)
+                        && forecast.as_mut().is_none_or(|forecast| forecast.wants(class, scale))
+                        && collector.wants(class, scale)
                 }));
             }
             if let Some(forecast) = &mut forecast {
@@ -193,6 +198,11 @@ impl<'a> Octave<'a> {
         level_sigma(self.options, extremum.level) * self.step_px()
     }
 
+    /// How well an extremum stands out.
+    fn class(&self, extremum: &Extremum) -> Class {
+        if extremum.contrast > self.options.peak_threshold { Class::Distinct } else { Class::Faint }
+    }
+
     /// The place of an extremum in original pixels (first pixel centre at 0.5, 0.5).
     fn place_px(&self, extremum: &Extremum) -> (f32, f32) {
         let step = self.step_px();
@@ -217,7 +227,8 @@ impl<'a> Octave<'a> {
     fn describe(&self, extremum: &Extremum, worker: &mut Worker, collector: &mut Collector<'_>) {
         let sigma = level_sigma(self.options, extremum.level);
         let scale = self.scale_px(extremum);
-        if !collector.wants(scale) {
+        let class = self.class(extremum);
+        if !collector.wants(class, scale) {
             return;
         }
         let (x, y) = self.place_px(extremum);
@@ -227,7 +238,7 @@ impl<'a> Octave<'a> {
         for orientation in orientation::find(self.isa, ring, size, at, sigma, self.options.max_orientations, patch) {
             let keypoint = Keypoint { x, y, scale, orientation };
             let descriptor = worker.describer.describe(self.isa, ring, size, at, sigma, orientation, patch);
-            collector.push(keypoint, descriptor);
+            collector.push(class, keypoint, descriptor);
         }
     }
 }

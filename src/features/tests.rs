@@ -202,9 +202,10 @@ fn output_is_sorted_capped_and_repeatable() {
     assert_eq!(all.keypoints.len(), all.descriptors.len());
     let key = |k: &crate::scene::Keypoint| (-k.scale, k.y, k.x, k.orientation);
     assert!(all.keypoints.windows(2).all(|pair| key(&pair[0]) < key(&pair[1])));
+    let distinct = extract(&image, &SiftOptions { faint_up_to: 0, ..SiftOptions::default() });
     let capped = extract(&image, &SiftOptions { max_features: 100, ..SiftOptions::default() });
-    assert_eq!(capped.keypoints, all.keypoints[..100]);
-    assert_eq!(capped.descriptors, all.descriptors[..100]);
+    assert_eq!(capped.keypoints, distinct.keypoints[..100]);
+    assert_eq!(capped.descriptors, distinct.descriptors[..100]);
     for keypoint in &all.keypoints {
         assert!((0.0..std::f32::consts::TAU).contains(&keypoint.orientation));
     }
@@ -212,6 +213,29 @@ fn output_is_sorted_capped_and_repeatable() {
         let norm = f64::from(distance_sq(descriptor, &[0; 128])).sqrt();
         assert!((500.0..524.0).contains(&norm), "norm {norm}");
     }
+}
+
+#[test]
+fn faint_features_make_up_the_number_and_no_more() {
+    let mut image = Scene::random(9, 600, 300.0, (0.8, 9.0)).render(300, 300);
+    let mut rng = Rng::from_parts(&[10]);
+    for value in &mut image.data {
+        *value = value.saturating_add((rng.uniform() * 3.0) as u8);
+    }
+    let options = SiftOptions::default();
+    let only = |faint_up_to| extract(&image, &SiftOptions { faint_up_to, ..options.clone() }).keypoints;
+    let distinct = only(0);
+    let all = extract(&image, &SiftOptions { peak_threshold: options.faint_threshold, ..options.clone() }).keypoints;
+    assert!(distinct.len() > 300 && all.len() > distinct.len() + 300, "{} {}", distinct.len(), all.len());
+    let faint: Vec<_> = all.iter().filter(|found| !distinct.contains(found)).collect();
+    for more in [1, 50, 200, 300] {
+        let with_faint = only(distinct.len() + more);
+        assert_eq!(with_faint.len(), distinct.len() + more);
+        let taken: Vec<_> = with_faint.iter().filter(|found| !distinct.contains(found)).collect();
+        assert_eq!(taken, faint[..more], "{more} more");
+    }
+    assert_eq!(only(distinct.len()), distinct);
+    assert_eq!(only(100), distinct);
 }
 
 #[test]
