@@ -6,6 +6,9 @@
 //! down to row y, about n(c) / F(y) will be seen in all. The largest c that promises more than enough is taken for the limit.
 //! A forecast is never trusted: when too few features were kept in the end, the octave is searched again without it, so
 //! what is kept does not depend on forecasts.
+//!
+//! Distinct and faint features (`collector`) have a limit each. The faint ones' follows from what they must make up: the number
+//! they fill less the distinct ones promised; where those promise it all, faint extrema are not even sought.
 
 use std::collections::BTreeMap;
 
