@@ -187,8 +187,8 @@ fn a_killed_process_goes_on_from_its_finished_units() {
     assert!(start(folder.path(), "whole", 1).wait().unwrap().success());
     let expected = models(folder.path(), "whole");
 
-    let kills = [("features", 7), ("coarse_match", 1), ("add_cameras", 1), ("add_points", 1)];
-    for (threads, (stage, units)) in [1, 3, 2, 4].into_iter().zip(kills) {
+    let kills = [("features", 7), ("coarse_match", 1), ("coarse_model", 1), ("add_cameras", 1), ("add_points", 1)];
+    for (threads, (stage, units)) in [1, 3, 2, 1, 4].into_iter().zip(kills) {
         let work = folder.path().join("killed/work");
         let mut life = start(folder.path(), "killed", threads);
         while stored_units(&work, stage) < units {
@@ -201,10 +201,16 @@ fn a_killed_process_goes_on_from_its_finished_units() {
     assert!(start(folder.path(), "killed", 2).wait().unwrap().success());
     let report = std::fs::read(folder.path().join("killed/out/report.json")).unwrap();
     let report: Report = serde_json::from_slice(&report).unwrap();
-    for (stage, unit) in [("coarse_match", "pairs"), ("add_cameras", "images"), ("add_points", "pairs")] {
+    let units = [
+        ("coarse_match", "pairs_tried", "pairs_reused"),
+        ("coarse_model", "images", "images_reused"),
+        ("add_cameras", "images_tried", "images_reused"),
+        ("add_points", "pairs_tried", "pairs_reused"),
+    ];
+    for (stage, all, reused) in units {
         let first = report.stages.iter().find(|of| of.name == stage).unwrap();
-        let (tried, reused) = (first.counts[&format!("{unit}_tried")], first.counts[&format!("{unit}_reused")]);
-        println!("{stage} went on from {reused} of {tried} {unit}");
+        let (tried, reused) = (first.counts[all], first.counts[reused]);
+        println!("{stage} went on from {reused} of {tried}");
         // Units end in any order, and the last is smaller; the kill may have come so late that the whole stage was stored.
         assert!(reused > 0.0 || first.reused, "{stage}: {reused} of {tried}");
     }

@@ -15,6 +15,9 @@ pub use filter::{KeepLimits, filter};
 pub use intrinsics::{
     IntrinsicsOptions, PrincipalPoint, add_camera, cameras_to_share, free_intrinsics, merge_agreeing_cameras,
 };
-pub use mapper::{CoarseModels, MapperImage, MapperInput, MapperOptions, Unregistered, reconstruct};
+pub use mapper::{
+    Checkpoint, Checkpoints, CoarseModels, MapperImage, MapperInput, MapperOptions, MapperRun, Unregistered,
+    reconstruct,
+};
 pub use match_graph::MatchGraph;
 pub use tracks::Tracks;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use super::coarse_match::{CoarseMatches, Matcher};
 use super::features::{FeatureCache, ImageFeatures};
+use super::growing::GrowingModels;
 use super::intake::Intake;
 use super::options::ReconstructionOptions;
 use super::run::key;
@@ -16,7 +17,7 @@ use crate::add_cameras::MatchCounts;
 use crate::camera::{Camera, Pixel};
 use crate::coarse::look_alikes::{self, CutPair, LookAlikeAccount};
 use crate::coarse::selection::SelectionOptions;
-use crate::coarse::{CoarseModels, MapperImage, MapperInput, MatchGraph};
+use crate::coarse::{CoarseModels, MapperImage, MapperInput, MapperRun, MatchGraph};
 use crate::scene::{ApartImages, CameraId, ImageId};
 
 /// Number of coarse matches of every pair that was matched, verified or not: what ranked matching goes by.
@@ -84,21 +85,21 @@ pub fn run(
                 let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
                 let input = mapper_input(intake, &cache, &matches);
                 cache.check(Stage::CoarseModel)?;
-                let keep_going = || !context.cancel.is_cancelled();
-                let told = |registered: usize| progress.set(registered as u64, usable as u64);
+                let growing = GrowingModels::new(Units::new(store, Stage::CoarseModel, &model_key));
+                let run = MapperRun {
+                    seed: context.seed,
+                    keep_going: &|| !context.cancel.is_cancelled() && !growing.has_failed(),
+                    progress: &|registered| progress.set(registered as u64, usable as u64),
+                    checkpoints: &growing,
+                };
                 let coarse = &options.coarse;
-                let (models, account) = look_alikes::reconstruct(
-                    &input,
-                    &coarse.look_alikes,
-                    &coarse.mapper,
-                    context.seed,
-                    &keep_going,
-                    &told,
-                );
+                let (models, account) = look_alikes::reconstruct(&input, &coarse.look_alikes, &coarse.mapper, &run);
+                let images_reused = growing.finish()?;
                 context.check_cancelled()?;
                 let points = models.models.iter().map(|model| model.num_points()).sum();
                 let totals = counts([
                     ("images", registered(&models)),
+                    ("images_reused", images_reused),
                     ("models", models.models.len()),
                     ("points", points),
                     ("pairs_doubted", account.suspected),

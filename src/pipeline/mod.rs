@@ -9,6 +9,7 @@ mod error;
 mod export;
 mod features;
 mod focals;
+mod growing;
 mod intake;
 mod localise;
 mod masks;

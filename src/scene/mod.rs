@@ -1,6 +1,7 @@
 //! What the stages pass on: ids, rasters, features, and the reconstruction (cameras, registered images, points, tracks).
 
 mod apart;
+mod bare_model;
 mod features;
 mod ids;
 mod raster;
@@ -8,6 +9,7 @@ mod reconstruction;
 pub mod world_frame;
 
 pub use apart::ApartImages;
+pub use bare_model::BareModel;
 pub use features::{DESCRIPTOR_LEN, Descriptor, Features, Keypoint};
 pub use ids::{CameraId, ImageId, KeypointIdx, Point3dId};
 pub use raster::{GrayImage, RgbImage};

@@ -67,9 +67,9 @@ pub struct Reconstruction {
     pub cameras: BTreeMap<CameraId, Camera>,
     /// Images, registered or not, that show different places that look alike: no track joins two of them.
     pub apart: ApartImages,
-    images: BTreeMap<ImageId, RegisteredImage>,
-    points: Vec<Option<Point3d>>,
-    num_points: usize,
+    pub(super) images: BTreeMap<ImageId, RegisteredImage>,
+    pub(super) points: Vec<Option<Point3d>>,
+    pub(super) num_points: usize,
 }
 
 impl Reconstruction {

@@ -30,8 +30,7 @@ use std::collections::BTreeSet;
 use serde::{Deserialize, Serialize};
 
 use super::MatchGraph;
-use super::mapper::{self, CoarseModels, MapperInput, MapperOptions};
-use crate::bundle::KeepGoing;
+use super::mapper::{self, CoarseModels, MapperInput, MapperOptions, MapperRun};
 use crate::scene::{ApartImages, ImageId};
 use judgement::Verdict;
 use skeleton::Suspect;
@@ -77,19 +76,17 @@ pub fn reconstruct(
     input: &MapperInput,
     options: &LookAlikeOptions,
     mapper_options: &MapperOptions,
-    seed: u64,
-    keep_going: &KeepGoing,
-    progress: &(dyn Fn(usize) + Sync),
+    run: &MapperRun<'_>,
 ) -> (CoarseModels, LookAlikeAccount) {
     let without = |left_out: &BTreeSet<(ImageId, ImageId)>, apart: ApartImages| {
         let kept = input.graph.pairs.iter().filter(|(pair, _)| !left_out.contains(pair));
         let graph = MatchGraph { pairs: kept.map(|(&pair, geometry)| (pair, geometry.clone())).collect() };
         MapperInput { images: input.images.clone(), cameras: input.cameras.clone(), graph, apart }
     };
-    let suspects = if options.enabled { skeleton::suspects(input, options, keep_going) } else { Vec::new() };
+    let suspects = if options.enabled { skeleton::suspects(input, options, run.keep_going) } else { Vec::new() };
     let put_off: BTreeSet<_> = suspects.iter().map(|suspect| suspect.images).collect();
     let confident = without(&put_off, ApartImages::default());
-    let models = mapper::reconstruct(&confident, mapper_options, seed, keep_going, progress);
+    let models = mapper::reconstruct(&confident, mapper_options, run);
     if suspects.is_empty() {
         return (models, LookAlikeAccount::default());
     }
@@ -100,7 +97,7 @@ pub fn reconstruct(
         return (models, account);
     }
     let judged = without(&account.cut.iter().map(|cut| cut.images).collect(), apart);
-    (mapper::extend(&judged, &models, mapper_options, seed, keep_going, progress), account)
+    (mapper::extend(&judged, &models, mapper_options, run), account)
 }
 
 /// The suspects that are cut: those whose matches join two places, and, once there is such a pair and the set is so known to

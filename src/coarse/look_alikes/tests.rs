@@ -91,7 +91,7 @@ impl World {
 
     fn reconstruct(&self, enabled: bool) -> (CoarseModels, LookAlikeAccount) {
         let options = LookAlikeOptions { enabled, ..LookAlikeOptions::default() };
-        reconstruct(&self.input, &options, &MapperOptions::default(), 0, &|| true, &|_| ())
+        reconstruct(&self.input, &options, &MapperOptions::default(), &MapperRun::undisturbed(0))
     }
 
     /// Points of all models that join sightings of different points of the world.

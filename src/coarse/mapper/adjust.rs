@@ -12,7 +12,7 @@ impl Mapper<'_> {
     /// Adjusts the initial pair, intrinsics fixed, and filters.
     pub(super) fn adjust_pair(&mut self) {
         let config = BundleConfig::global(&self.model, FreeIntrinsics::default());
-        bundle::adjust_while(&mut self.model, &config, &self.options.global_bundle, self.keep_going);
+        bundle::adjust_while(&mut self.model, &config, &self.options.global_bundle, self.run.keep_going);
         self.filter(None);
     }
 
@@ -24,21 +24,21 @@ impl Mapper<'_> {
         if variable.len() == self.model.images().len() {
             config = BundleConfig::global(&self.model, FreeIntrinsics::default());
         }
-        bundle::adjust_while(&mut self.model, &config, &self.options.local_bundle, self.keep_going);
+        bundle::adjust_while(&mut self.model, &config, &self.options.local_bundle, self.run.keep_going);
         self.filter(Some(&variable));
     }
 
     /// Adjusts everything, filters and retriangulates until little changes.
     pub(super) fn adjust_globally(&mut self) {
         for _ in 0..self.options.global_rounds {
-            if !(self.keep_going)() {
+            if !self.goes_on() {
                 return;
             }
             let before = self.model.num_observations();
             let split = self.split_cameras();
             let mut config = BundleConfig::global(&self.model, FreeIntrinsics::default());
             config.intrinsics = self.free_intrinsics();
-            bundle::adjust_while(&mut self.model, &config, &self.options.global_bundle, self.keep_going);
+            bundle::adjust_while(&mut self.model, &config, &self.options.global_bundle, self.run.keep_going);
             let merged = merge_agreeing_cameras(&mut self.model, &self.options.intrinsics);
             let removed = self.filter(None);
             let all: Vec<usize> = (0..self.tracks.tracks.len()).collect();
@@ -61,7 +61,7 @@ impl Mapper<'_> {
 
     /// Gives every camera the model its images determine and adjusts a last time.
     pub(super) fn finish(&mut self) {
-        if !(self.keep_going)() {
+        if !self.goes_on() {
             return;
         }
         self.split_cameras_by_adjustment();

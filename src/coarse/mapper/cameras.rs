@@ -52,7 +52,7 @@ impl Mapper<'_> {
         if (image.num_observations() as f64) < self.options.settled_share * visible.len() as f64 {
             // Much was filtered: the pose itself may be wrong, and what is left of the points confirms it.
             let (points, pixels) = matches(visible);
-            let mut rng = Rng::from_parts(&[self.seed, STREAM, u64::from(id.0)]);
+            let mut rng = Rng::from_parts(&[self.run.seed, STREAM, u64::from(id.0)]);
             let shared = std::slice::from_ref(camera);
             let placed = absolute_pose::estimate_sharing(&points, &pixels, shared, &options, &mut rng)?;
             return placed.shares.is_none().then_some((placed.pose.cam_from_world, placed.pose.camera));
@@ -83,7 +83,7 @@ impl Mapper<'_> {
             let free = FreeIntrinsics { focal: true, ..FreeIntrinsics::default() };
             config.intrinsics.insert(freed.images()[id].camera, free);
         }
-        bundle::adjust_while(&mut freed, &config, &self.options.global_bundle, self.keep_going);
+        bundle::adjust_while(&mut freed, &config, &self.options.global_bundle, self.run.keep_going);
         let options = &self.options.pose.sharing;
         let stays = |id: &ImageId| {
             let (own, given) = (freed.camera_of(*id), self.model.camera_of(*id));

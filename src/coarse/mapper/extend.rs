@@ -2,8 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::{CoarseModels, Mapper, MapperInput, MapperOptions, empty_model, reconstruct};
-use crate::bundle::KeepGoing;
+use super::{CoarseModels, Mapper, MapperInput, MapperOptions, MapperRun, empty_model, reconstruct};
 use crate::coarse::Tracks;
 use crate::scene::{ImageId, Reconstruction};
 
@@ -14,9 +13,7 @@ pub fn extend(
     input: &MapperInput,
     models: &CoarseModels,
     options: &MapperOptions,
-    seed: u64,
-    keep_going: &KeepGoing,
-    progress: &(dyn Fn(usize) + Sync),
+    run: &MapperRun<'_>,
 ) -> CoarseModels {
     let images_of = |model: &Reconstruction| -> BTreeSet<ImageId> { model.images().keys().copied().collect() };
     let placed: Vec<BTreeSet<ImageId>> = models.models.iter().map(images_of).collect();
@@ -24,15 +21,15 @@ pub fn extend(
         input.graph.components().into_iter().filter(|component| component.len() >= options.min_model_images).collect();
     let is_whole = components.len() == placed.len() && components.iter().all(|component| placed.contains(component));
     if !is_whole {
-        return reconstruct(input, options, seed, keep_going, progress);
+        return reconstruct(input, options, run);
     }
     let mut extended = CoarseModels { models: Vec::new(), unregistered: models.unregistered.clone() };
     for (model, component) in models.models.iter().zip(&placed) {
         let graph = input.graph.restricted_to(component);
-        let tracks = Tracks::build(&graph, &input.apart, keep_going);
-        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, seed, keep_going);
+        let tracks = Tracks::build(&graph, &input.apart, run.keep_going);
+        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, run);
         mapper.adopt(model);
-        mapper.grow(progress);
+        mapper.grow();
         for (image, reason) in mapper.reasons() {
             extended.unregistered.insert(image, reason);
         }

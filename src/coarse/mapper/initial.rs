@@ -29,7 +29,7 @@ impl Mapper<'_> {
             let pairs: Vec<(ImageId, ImageId)> =
                 fitting.take(self.options.initial_trials).map(|candidate| candidate.pair).collect();
             for pair in pairs {
-                if !(self.keep_going)() {
+                if !self.goes_on() {
                     return false;
                 }
                 used.insert(pair);

@@ -6,6 +6,7 @@
 
 mod adjust;
 mod cameras;
+mod checkpoint;
 mod extend;
 mod initial;
 mod options;
@@ -14,6 +15,7 @@ mod register;
 mod tests;
 mod triangulate;
 
+pub use checkpoint::{Checkpoint, Checkpoints, MapperRun};
 pub use extend::extend;
 pub use options::MapperOptions;
 
@@ -23,9 +25,9 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::{MatchGraph, Tracks};
-use crate::bundle::KeepGoing;
 use crate::camera::{Camera, Pixel};
 use crate::scene::{ApartImages, CameraId, ImageId, Point3dId, Reconstruction};
+use checkpoint::Growth;
 
 /// What the mapper is told of an image.
 #[derive(Clone, Debug)]
@@ -80,22 +82,15 @@ pub struct CoarseModels {
     pub unregistered: BTreeMap<ImageId, Unregistered>,
 }
 
-/// Reconstructs every component of the graph. `keep_going` is asked at every registration and every step of an adjustment; once it
-/// says no, what there is so far is returned. `progress` is told the number of images registered.
-pub fn reconstruct(
-    input: &MapperInput,
-    options: &MapperOptions,
-    seed: u64,
-    keep_going: &KeepGoing,
-    progress: &(dyn Fn(usize) + Sync),
-) -> CoarseModels {
+/// Reconstructs every component of the graph.
+pub fn reconstruct(input: &MapperInput, options: &MapperOptions, run: &MapperRun<'_>) -> CoarseModels {
     let mut result = CoarseModels::default();
     for &image in input.images.keys() {
         result.unregistered.insert(image, Unregistered::NoPairs);
     }
     for component in input.graph.components() {
         let mut remaining = component;
-        while remaining.len() >= options.min_model_images && keep_going() {
+        while remaining.len() >= options.min_model_images && (run.keep_going)() {
             for &image in &remaining {
                 result.unregistered.entry(image).and_modify(|why| {
                     if *why == Unregistered::NoPairs {
@@ -104,8 +99,9 @@ pub fn reconstruct(
                 });
             }
             let done: usize = result.models.iter().map(|model| model.images().len()).sum();
-            let told = |registered: usize| progress(done + registered);
-            let Some((model, reasons)) = best_model(input, &remaining, options, seed, keep_going, &told) else { break };
+            let told = |registered: usize| (run.progress)(done + registered);
+            let run = MapperRun { progress: &told, ..*run };
+            let Some((model, reasons)) = best_model(input, &remaining, options, &run) else { break };
             for (image, reason) in reasons {
                 result.unregistered.insert(image, reason);
             }
@@ -128,20 +124,18 @@ fn best_model(
     input: &MapperInput,
     component: &BTreeSet<ImageId>,
     options: &MapperOptions,
-    seed: u64,
-    keep_going: &KeepGoing,
-    progress: &(dyn Fn(usize) + Sync),
+    run: &MapperRun<'_>,
 ) -> Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> {
     let graph = input.graph.restricted_to(component);
-    let tracks = Tracks::build(&graph, &input.apart, keep_going);
+    let tracks = Tracks::build(&graph, &input.apart, run.keep_going);
     let mut used_starts = BTreeSet::new();
     let mut best: Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> = None;
     for _ in 0..options.max_starts {
-        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, seed, keep_going);
+        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, run);
         if !mapper.start(&mut used_starts) {
             break;
         }
-        mapper.grow(progress);
+        mapper.grow();
         let registered = mapper.model.images().len();
         if registered >= options.min_model_images
             && best.as_ref().is_none_or(|(model, _)| registered > model.images().len())
@@ -149,7 +143,7 @@ fn best_model(
             let reasons = mapper.reasons();
             best = Some((mapper.model, reasons));
         }
-        if registered as f64 >= options.satisfied_share * component.len() as f64 || !keep_going() {
+        if registered as f64 >= options.satisfied_share * component.len() as f64 || !(run.keep_going)() {
             break;
         }
     }
@@ -170,8 +164,7 @@ pub(super) struct Mapper<'a> {
     tracks: &'a Tracks,
     component: &'a BTreeSet<ImageId>,
     options: &'a MapperOptions,
-    seed: u64,
-    keep_going: &'a KeepGoing<'a>,
+    run: &'a MapperRun<'a>,
     model: Reconstruction,
     /// The last point each track was given; it may have been filtered since.
     point_of_track: Vec<Option<Point3dId>>,
@@ -190,8 +183,7 @@ impl<'a> Mapper<'a> {
         tracks: &'a Tracks,
         component: &'a BTreeSet<ImageId>,
         options: &'a MapperOptions,
-        seed: u64,
-        keep_going: &'a KeepGoing<'a>,
+        run: &'a MapperRun<'a>,
     ) -> Self {
         Self {
             input,
@@ -199,8 +191,7 @@ impl<'a> Mapper<'a> {
             tracks,
             component,
             options,
-            seed,
-            keep_going,
+            run,
             model: empty_model(input),
             point_of_track: vec![None; tracks.tracks.len()],
             trials: BTreeMap::new(),
@@ -210,35 +201,53 @@ impl<'a> Mapper<'a> {
         }
     }
 
-    /// Registers image after image until none can be, then adjusts everything.
-    fn grow(&mut self, progress: &(dyn Fn(usize) + Sync)) {
-        let mut adjusted_at = (self.model.images().len(), self.model.num_points());
-        let mut min_inliers = self.options.min_pose_inliers;
-        while (self.keep_going)() {
-            progress(self.model.images().len());
-            let Some(image) = self.register_next(min_inliers) else {
-                let size = (self.model.images().len(), self.model.num_points());
-                if adjusted_at.0 != size.0 {
-                    self.adjust_globally();
-                    adjusted_at = (self.model.images().len(), self.model.num_points());
-                } else if min_inliers > self.options.min_pose_inliers_relaxed {
-                    min_inliers = self.options.min_pose_inliers_relaxed;
-                } else {
+    fn goes_on(&self) -> bool {
+        (self.run.keep_going)()
+    }
+
+    /// Number of images and of points.
+    fn size(&self) -> (usize, usize) {
+        (self.model.images().len(), self.model.num_points())
+    }
+
+    /// Registers image after image until none can be, then adjusts everything. What an earlier run did of that is taken up.
+    fn grow(&mut self) {
+        let from_start = Growth { adjusted_at: self.size(), min_inliers: self.options.min_pose_inliers };
+        let mut growth = self.take_up().unwrap_or(from_start);
+        if self.is_whole {
+            return;
+        }
+        while self.goes_on() {
+            (self.run.progress)(self.model.images().len());
+            let Some(image) = self.register_next(growth.min_inliers) else {
+                let has_grown = growth.adjusted_at.0 != self.model.images().len();
+                if !has_grown && growth.min_inliers <= self.options.min_pose_inliers_relaxed {
                     break;
                 }
                 self.trials.clear();
+                if has_grown {
+                    self.adjust_and_keep(&mut growth);
+                } else {
+                    growth.min_inliers = self.options.min_pose_inliers_relaxed;
+                }
                 continue;
             };
             self.triangulate_image(image);
             self.adjust_locally(image);
-            let size = (self.model.images().len(), self.model.num_points());
+            let (size, then) = (self.size(), growth.adjusted_at);
             let grown = |now: usize, then: usize| now as f64 >= self.options.global_growth * then as f64;
-            if grown(size.0, adjusted_at.0) || grown(size.1, adjusted_at.1) {
-                self.adjust_globally();
-                adjusted_at = (self.model.images().len(), self.model.num_points());
+            if grown(size.0, then.0) || grown(size.1, then.1) {
+                self.adjust_and_keep(&mut growth);
             }
         }
         self.finish();
+        self.keep(growth);
+    }
+
+    fn adjust_and_keep(&mut self, growth: &mut Growth) {
+        self.adjust_globally();
+        growth.adjusted_at = self.size();
+        self.keep(*growth);
     }
 
     /// Triangulates and completes the tracks of an image.

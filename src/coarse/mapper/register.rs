@@ -43,7 +43,7 @@ impl Mapper<'_> {
             }
         }
         ranking.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
-        let keep_going = self.keep_going;
+        let keep_going = self.run.keep_going;
         let mut in_turn = ranking.into_iter().map(|(_, image)| image).take_while(|_| keep_going());
         in_turn.find(|&image| self.try_register(image, min_inliers))
     }
@@ -96,7 +96,7 @@ impl Mapper<'_> {
             // The shared focal length itself may still be a guess: it is no measure of others.
             options.sharing.min_matches = usize::MAX;
         }
-        let mut rng = Rng::from_parts(&[self.seed, STREAM, u64::from(image.0), u64::from(trial)]);
+        let mut rng = Rng::from_parts(&[self.run.seed, STREAM, u64::from(image.0), u64::from(trial)]);
         let placed = if shareable.is_empty() {
             let pose = absolute_pose::estimate(&points, &pixels, own, &options, &mut rng);
             pose.map(|pose| (Some(input.camera), pose))

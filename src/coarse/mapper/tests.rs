@@ -1,6 +1,8 @@
 //! The mapper on scenes whose truth is known: images of one size, without EXIF, that were zoomed.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::*;
 use crate::camera::{CameraModel, FocalSource};
@@ -59,7 +61,7 @@ fn zoomed_images_get_a_camera_of_their_own() {
         };
         let scene = generate(&options);
         let input = without_exif(&scene, &options, 1.04 * options.focal_px);
-        let models = reconstruct(&input, &MapperOptions::default(), 1, &|| true, &|_| ());
+        let models = reconstruct(&input, &MapperOptions::default(), &MapperRun::undisturbed(1));
         let model = &models.models[0];
         assert_eq!(model.images().len(), 16, "{layout:?} {zoom}");
         let found = focals_px(model);
@@ -84,7 +86,7 @@ fn images_of_one_zoom_share_one_camera() {
         };
         let scene = generate(&options);
         let input = without_exif(&scene, &options, 1.2 * options.focal_px);
-        let models = reconstruct(&input, &MapperOptions::default(), 1, &|| true, &|_| ());
+        let models = reconstruct(&input, &MapperOptions::default(), &MapperRun::undisturbed(1));
         let model = &models.models[0];
         assert_eq!(model.images().len(), 16, "{layout:?}");
         let used: BTreeSet<CameraId> = model.images().values().map(|image| image.camera).collect();
@@ -103,7 +105,64 @@ fn an_image_that_never_holds_is_given_up() {
     }
     let input = without_exif(&scene, &options, options.focal_px);
     let mapper = MapperOptions { min_pose_inliers_relaxed: 60, ..MapperOptions::default() };
-    let models = reconstruct(&input, &mapper, 1, &|| true, &|_| ());
+    let models = reconstruct(&input, &mapper, &MapperRun::undisturbed(1));
     assert_eq!(models.models[0].images().len(), 15);
     assert!(matches!(models.unregistered[&weak], Unregistered::PoseFailed { .. }), "{:?}", models.unregistered);
+}
+
+/// Keeps the bytes of every checkpoint, and says when it is enough.
+#[derive(Default)]
+struct Kept {
+    begun: AtomicUsize,
+    last: Mutex<BTreeMap<usize, Vec<u8>>>,
+    num_kept: AtomicUsize,
+}
+
+impl Checkpoints for Kept {
+    fn begin(&self) -> Option<Checkpoint<'static>> {
+        let model = self.begun.fetch_add(1, Ordering::SeqCst) + 1;
+        self.last.lock().unwrap().get(&model).map(|bytes| postcard::from_bytes(bytes).unwrap())
+    }
+
+    fn keep(&self, checkpoint: &Checkpoint<'_>) {
+        let bytes = postcard::to_stdvec(checkpoint).unwrap();
+        self.last.lock().unwrap().insert(self.begun.load(Ordering::SeqCst), bytes);
+        self.num_kept.fetch_add(1, Ordering::SeqCst);
+    }
+}
+
+/// Two scenes without a common point, so that there are two models, of two zooms each: wherever a reconstruction is stopped, going on
+/// from what was kept gives the same models to the last bit.
+#[test]
+fn a_stopped_reconstruction_goes_on_from_what_was_kept() {
+    let options = SceneOptions { num_images: 12, num_points: 600, zoom: 1.3, ..SceneOptions::default() };
+    let scene = generate(&options);
+    let mut input = without_exif(&scene, &options, options.focal_px);
+    let moved = |id: ImageId| ImageId(id.0 + 100);
+    let images: Vec<_> = input.images.iter().map(|(&id, image)| (moved(id), image.clone())).collect();
+    input.images.extend(images);
+    let pairs: Vec<_> = input.graph.pairs.iter().map(|(&(a, b), pair)| ((moved(a), moved(b)), pair.clone())).collect();
+    input.graph.pairs.extend(pairs);
+
+    let mapper = MapperOptions::default();
+    let all = Kept::default();
+    let run = MapperRun { checkpoints: &all, ..MapperRun::undisturbed(1) };
+    let bytes = |models: &CoarseModels| postcard::to_stdvec(models).unwrap();
+    let whole = reconstruct(&input, &mapper, &run);
+    assert_eq!(whole.models.len(), 2);
+    let num_kept = all.num_kept.load(Ordering::SeqCst);
+    assert!(num_kept > 6, "{num_kept}");
+    for enough in 1..=num_kept {
+        let kept = Kept::default();
+        let keep_going = || kept.num_kept.load(Ordering::SeqCst) < enough;
+        reconstruct(&input, &mapper, &MapperRun { keep_going: &keep_going, checkpoints: &kept, ..run });
+        kept.begun.store(0, Ordering::SeqCst);
+        let placed = AtomicUsize::new(usize::MAX);
+        let progress = |registered: usize| {
+            placed.fetch_min(registered, Ordering::SeqCst);
+        };
+        let after = reconstruct(&input, &mapper, &MapperRun { progress: &progress, checkpoints: &kept, ..run });
+        assert!(placed.load(Ordering::SeqCst) > 2, "stopped after {enough}: begins anew");
+        assert!(bytes(&after) == bytes(&whole), "stopped after {enough} of {num_kept}: another model");
+    }
 }

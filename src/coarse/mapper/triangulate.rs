@@ -76,7 +76,7 @@ impl Mapper<'_> {
         let found: Vec<Option<(Vector3<f64>, Vec<Observation>)>> = tracks
             .par_iter()
             .map(|&track| {
-                let is_missing = this.live_point(track).is_none() && (this.keep_going)();
+                let is_missing = this.live_point(track).is_none() && this.goes_on();
                 is_missing.then(|| this.find_point(track)).flatten()
             })
             .collect();
