@@ -34,6 +34,16 @@ impl<'a> Collector<'a> {
         Self { limit, faint_up_to, keeps, scales: Default::default(), found: Vec::new() }
     }
 
+    /// Distinct features kept at most.
+    pub(super) fn limit(&self) -> usize {
+        self.limit
+    }
+
+    /// The number that faint features make up.
+    pub(super) fn faint_up_to(&self) -> usize {
+        self.faint_up_to
+    }
+
     /// Features of a class that are kept at most, given the distinct ones so far.
     fn room(&self, class: Class) -> usize {
         match class {

@@ -66,8 +66,7 @@ pub fn extract_where(image: &GrayImage, options: &SiftOptions, keeps: &dyn Fn(f3
 
 fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions, keeps: &dyn Fn(f32, f32) -> bool) -> Features {
     let limit = options.limit(image.width, image.height);
-    let faint_up_to = options.faint_up_to.min(limit);
-    let mut collector = Collector::new(limit, faint_up_to, keeps);
+    let mut collector = Collector::new(limit, options.faint_up_to.min(limit), keeps);
     if image.width == 0 || image.height == 0 || limit == 0 {
         return collector.finish();
     }
@@ -84,20 +83,20 @@ fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions, keeps: &dyn 
         seed = Some(Octave::new(isa, Source::seed(plane), octave_index, options).run(&mut collector, None));
     }
     if has_octave_0 && crowded {
-        run_foretold(octave_0, &mut collector, limit, faint_up_to);
+        run_foretold(octave_0, &mut collector);
     }
     let doubled = options.first_octave < 0 && 2 * image.width.min(image.height) >= MIN_OCTAVE_SIDE;
     if doubled && collector.wants(Class::Distinct, Octave::max_scale_px(-1, options)) {
         let octave = || Octave::new(isa, Source::doubled(image, options), -1, options);
-        run_foretold(octave, &mut collector, limit, faint_up_to);
+        run_foretold(octave, &mut collector);
     }
     collector.finish()
 }
 
 /// Runs an octave with a forecast from the coarser ones, and again without one where that kept too few.
-fn run_foretold<'a>(octave: impl Fn() -> Octave<'a>, collector: &mut Collector<'_>, limit: usize, faint_up_to: usize) {
+fn run_foretold<'a>(octave: impl Fn() -> Octave<'a>, collector: &mut Collector<'_>) {
     let before = collector.clone();
-    let mut forecast = Forecast::new(|class| collector.keypoints(class), limit, faint_up_to);
+    let mut forecast = Forecast::new(|class| collector.keypoints(class), collector.limit(), collector.faint_up_to());
     octave().run(collector, Some(&mut forecast));
     let is_wrong = [Class::Distinct, Class::Faint].into_iter().any(|class| {
         let complete_from = forecast.complete_from(class);

@@ -4,7 +4,8 @@ use sqlx::SqliteConnection;
 use uuid::Uuid;
 
 use super::JobState;
-use super::queue::{Jobs, JobsError, state_of};
+use super::JobsError;
+use super::queue::{Jobs, state_of};
 use crate::store::StoreError;
 use crate::store::db::{datasets, jobs};
 

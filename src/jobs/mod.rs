@@ -5,7 +5,9 @@
 
 mod again;
 mod deletion;
+mod ending;
 mod engine;
+mod error;
 mod eta;
 mod executor;
 mod figures;
@@ -22,11 +24,12 @@ pub mod view;
 pub mod webhooks;
 
 pub use engine::{Engine, PipelineEngine};
+pub use error::JobsError;
 pub use eta::{Eta, estimate, share_done};
 pub use executor::{Executor, Tick};
 pub use figures::{Figures, StageSums, Sums};
 pub use hub::Hub;
-pub use queue::{Jobs, JobsError, MAX_NAME_CHARS, MAX_PRIORITY, NewJob, state_of};
+pub use queue::{Jobs, MAX_NAME_CHARS, MAX_PRIORITY, NewJob, state_of};
 pub use recovery::{Recovered, recover};
 pub use resources::{Fit, Hold, Machine, fit};
 pub use retention::{Stale, find_stale, remove_stale};

@@ -1,5 +1,6 @@
 //! Durable storage: SQLite tables, photographs and outputs as files, and the artifact store.
 
+mod appender;
 mod archive;
 mod artifacts;
 pub(crate) mod atomic;
@@ -27,6 +28,7 @@ use std::sync::Arc;
 
 use tokio::sync::Mutex;
 
+pub use appender::{Appended, Appender};
 pub use archive::{ArchiveError, ArchiveLimits, unpack};
 pub use artifacts::ArtifactStore;
 pub use backup::{BackedUp, back_up};
@@ -42,7 +44,7 @@ pub use outputs::Checksums;
 pub use placing::Committed;
 pub(crate) use quota::check as check_quota;
 pub use quota::{Quantity, Quota};
-pub use resumable::{Appended, Appender, NewUpload, UploadError, UploadKind};
+pub use resumable::{NewUpload, UploadError, UploadKind};
 use space::{Promised, Reservations};
 pub use token::{Scope, create_token, find_token};
 use writable::Writable;
