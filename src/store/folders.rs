@@ -42,6 +42,12 @@ impl DurableFolders {
         }
         Ok(())
     }
+
+    /// `folder` was removed with all below it.
+    pub(super) fn forget(&self, folder: &Path) {
+        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        known.retain(|path| !path.starts_with(folder));
+    }
 }
 
 #[cfg(test)]
@@ -55,6 +61,10 @@ mod tests {
         let folders = DurableFolders::default();
         let deep = root.path().join("a/b/c");
         folders.make(root.path(), &deep).unwrap();
+        folders.make(root.path(), &deep).unwrap();
+        assert!(deep.is_dir());
+        std::fs::remove_dir_all(root.path().join("a/b")).unwrap();
+        folders.forget(&root.path().join("a/b"));
         folders.make(root.path(), &deep).unwrap();
         assert!(deep.is_dir());
         std::fs::write(root.path().join("a/file"), b"x").unwrap();

@@ -160,16 +160,19 @@ impl Store {
         if db::discards::is_held(self.db.reader(), db::now_ms()).await? {
             return Ok(());
         }
-        let (data, mut folders) = (self.data.clone(), db::discards::list(self.db.reader()).await?);
+        let (data, mut deleted) = (self.data.clone(), db::discards::list(self.db.reader()).await?);
+        let folders = Arc::clone(&self.folders);
         let removing = tokio::task::spawn_blocking(move || {
-            folders.retain(|folder| match data.discard(&data.root().join(folder)) {
-                Ok(()) => true,
-                Err(error) => {
+            deleted.retain(|folder| {
+                let path = data.root().join(folder);
+                let removed = data.discard(&path);
+                folders.forget(&path);
+                if let Err(error) = &removed {
                     tracing::warn!(folder, %error, "a deleted folder could not be removed");
-                    false
                 }
+                removed.is_ok()
             });
-            folders
+            deleted
         });
         let removed = removing.await.map_err(io::Error::other)?;
         if removed.is_empty() {

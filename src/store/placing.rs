@@ -171,10 +171,12 @@ impl Store {
     pub(super) async fn withdraw(&self, dataset: Uuid, moved: Moved, error: StoreError) -> StoreError {
         // A folder that went with its dataset is no failure of the disk, and must not come back with a file in it.
         let is_gone = matches!(datasets::in_use(self.db.reader(), dataset).await, Ok(None));
-        let (data, folder) = (self.data.clone(), self.data.dataset(dataset));
+        let (data, folder, folders) = (self.data.clone(), self.data.dataset(dataset), Arc::clone(&self.folders));
         let removed = tokio::task::spawn_blocking(move || {
             if is_gone {
-                return data.discard(&folder);
+                let removed = data.discard(&folder);
+                folders.forget(&folder);
+                return removed;
             }
             moved.files.iter().try_for_each(std::fs::remove_file)
         });
