@@ -214,6 +214,9 @@ impl IntoResponse for Problem {
     }
 }
 
+/// Why a path is in conflict: other bytes, or a folder where there is a photograph, or the other way round.
+const OTHERWISE_STORED: &str = "something else is stored already at this path or at one of its folders";
+
 impl From<StoreError> for Problem {
     fn from(error: StoreError) -> Self {
         if error.is_disk_full() {
@@ -224,9 +227,7 @@ impl From<StoreError> for Problem {
             return Self::new(Code::DiskError).detail("the disk can't be read or written");
         }
         match error {
-            StoreError::FileConflict(path) => {
-                Self::new(Code::FileConflict).detail("the path is stored already with other bytes").path(path)
-            }
+            StoreError::FileConflict(path) => Self::new(Code::FileConflict).detail(OTHERWISE_STORED).path(path),
             StoreError::QuotaExceeded { quantity, .. } => Self::new(match quantity {
                 Quantity::Bytes => Code::BytesQuotaExceeded,
                 Quantity::Images => Code::ImagesQuotaExceeded,
@@ -283,8 +284,7 @@ impl From<UploadError> for Problem {
             UploadError::NotAPart(_) => Code::InvalidUpload,
             UploadError::TooLong(_) => Code::PayloadTooLarge,
             UploadError::Conflict(path) => {
-                let detail = "the path is stored already with other bytes";
-                return Self::new(Code::UploadConflict).detail(detail).path(path);
+                return Self::new(Code::UploadConflict).detail(OTHERWISE_STORED).path(path);
             }
         };
         Self::new(code).detail(error)

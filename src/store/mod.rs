@@ -69,8 +69,8 @@ pub struct Store {
 /// Why the store refused or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
-    /// The path is stored with other bytes, or is a folder of another.
-    #[error("{0:?} is stored already with other bytes")]
+    /// The path is stored with other bytes, or is a folder of another, or one of its folders is a photograph.
+    #[error("something else is stored already at {0:?} or at one of its folders")]
     FileConflict(String),
     /// A job on the dataset is queued or running.
     #[error("a job uses the dataset")]

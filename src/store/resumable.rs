@@ -72,8 +72,8 @@ pub enum UploadError {
     /// Its time is over.
     #[error("the upload has expired")]
     Expired,
-    /// The path is stored with other bytes.
-    #[error("{0:?} is stored already with other bytes")]
+    /// As [`StoreError::FileConflict`].
+    #[error("something else is stored already at {0:?} or at one of its folders")]
     Conflict(String),
     /// Something to be put together is no complete partial upload.
     #[error("{0} is no complete partial upload")]
