@@ -22,7 +22,7 @@ pub struct IntrinsicsOptions {
     /// Whether the principal point is estimated or held in the middle of the picture.
     pub principal_point: PrincipalPoint,
     /// Images sharing a camera before its principal point is freed. Measured on sets of four to seven surveyed photographs, freeing
-    /// it raises the AUC at 1 degree from 63 to 90 (own focal lengths for all, as COLMAP has them: 82); with three it may go astray.
+    /// it raises the AUC at 1 degree from 65 to 91 (own focal lengths for all, as COLMAP has them: 81); with three it may go astray.
     pub min_images_for_principal_point: usize,
     /// Images sharing a camera before it gets two radial coefficients.
     pub min_images_for_radial: usize,
