@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use super::atomic;
+use super::{DataDir, atomic};
 
 /// Folders that are remembered; beyond that all are forgotten and found out again, which costs a sync each.
 const MOST: usize = 10_000;
@@ -43,8 +43,18 @@ impl DurableFolders {
         Ok(())
     }
 
-    /// `folder` was removed with all below it.
-    pub(super) fn forget(&self, folder: &Path) {
+    /// Removes `folder` with all below it, as far as it is there. Blocking.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub(super) fn discard(&self, data: &DataDir, folder: &Path) -> io::Result<()> {
+        let removed = data.discard(folder);
+        // Afterwards: whoever makes it again meanwhile must not be believed for longer than it is there.
+        self.forget(folder);
+        removed
+    }
+
+    fn forget(&self, folder: &Path) {
         let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         known.retain(|path| !path.starts_with(folder));
     }

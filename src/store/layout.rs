@@ -3,8 +3,9 @@
 //! ```text
 //! lock                       held by the process that uses the directory
 //! multistage.db              SQLite (with -wal and -shm beside it)
-//! datasets/<id>/images/...   photographs under the names they came with
-//! datasets/<id>/work/...     artifacts of runs, to go on from, also with other options
+//! datasets/<id>/             one dataset:
+//!     images/...             photographs under the names they came with
+//!     work/...               artifacts of runs, to go on from, also with other options
 //! jobs/<id>/partial/...      outputs while a run writes them
 //! jobs/<id>/out/...          published outputs
 //! jobs/<id>/thumbnails/...   made on demand

@@ -164,9 +164,7 @@ impl Store {
         let folders = Arc::clone(&self.folders);
         let removing = tokio::task::spawn_blocking(move || {
             deleted.retain(|folder| {
-                let path = data.root().join(folder);
-                let removed = data.discard(&path);
-                folders.forget(&path);
+                let removed = folders.discard(&data, &data.root().join(folder));
                 if let Err(error) = &removed {
                     tracing::warn!(folder, %error, "a deleted folder could not be removed");
                 }

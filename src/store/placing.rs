@@ -174,9 +174,7 @@ impl Store {
         let (data, folder, folders) = (self.data.clone(), self.data.dataset(dataset), Arc::clone(&self.folders));
         let removed = tokio::task::spawn_blocking(move || {
             if is_gone {
-                let removed = data.discard(&folder);
-                folders.forget(&folder);
-                return removed;
+                return folders.discard(&data, &folder);
             }
             moved.files.iter().try_for_each(std::fs::remove_file)
         });
