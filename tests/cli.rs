@@ -22,6 +22,8 @@ mod rendered;
 mod synthesize;
 #[path = "cli/token.rs"]
 mod token;
+#[path = "cli/trial.rs"]
+mod trial;
 #[path = "cli/zoomed.rs"]
 mod zoomed;
 

@@ -37,7 +37,12 @@ pub struct Coarse {
 
 /// Memory for features read for their positions; they are read once here, so little is kept.
 const POSITION_CACHE_BYTES: usize = 64 << 20;
+
 /// Matches and reconstructs the largest scales; widens the selection while too few images are registered and keeps the best.
+///
+/// A selection takes over the pairs among the images of the largest model so far. Not so after the trial: where its few
+/// features leave images out, they hold the others together but weakly, too, and a street of 29 photographs went astray at
+/// such joins. So the selection after it starts anew. And where the trial finds look-alikes, it isn't trusted to tell them apart.
 pub fn run(
     runner: &mut Runner<'_>,
     intake: &Intake,
@@ -50,11 +55,18 @@ pub fn run(
     let usable = found.values().filter(|image| matches!(image.count, Ok(count) if count > 0)).count();
     let mut best: Option<(CoarseModels, LookAlikeAccount)> = None;
     let mut before = CoarseMatches::default();
-    let selections = std::iter::successors(Some(options.coarse.selection.clone()), SelectionOptions::widened);
-    for (round, selection) in (1u32..).zip(selections) {
+    let full = &options.coarse.selection;
+    let trial = full.trial(usable);
+    let selections = std::iter::successors(Some(full.clone()), SelectionOptions::widened);
+    for (round, selection) in (1u32..).zip(trial.clone().into_iter().chain(selections)) {
         let iteration = (round > 1).then_some(round);
+        let is_trial_over = trial.is_some() && selection == *full;
+        if is_trial_over {
+            before = CoarseMatches::default();
+        }
         let settled = best
             .as_ref()
+            .filter(|_| !is_trial_over)
             .and_then(|(models, _)| models.models.first())
             .map(|model| model.images().keys().copied().collect());
         let match_key = ArtifactKey::of("coarse_match", &[&base_key.0, &selection]);
@@ -112,6 +124,14 @@ pub fn run(
                 notes.push(note.clone());
             }
         }
+        let is_trial = trial.as_ref() == Some(&selection);
+        if is_trial && account.apart_share() > full.trial_max_apart_share {
+            notes.push(
+                "Some photographs show different places that look alike: more features were matched to tell them apart."
+                    .to_owned(),
+            );
+            continue;
+        }
         let largest = |models: &CoarseModels| models.models.first().map_or(0, |model| model.images().len());
         let reached = largest(&models);
         if best.as_ref().is_none_or(|(best, _)| (reached, registered(&models)) > (largest(best), registered(best))) {
@@ -131,10 +151,9 @@ pub fn run(
             break;
         }
         notes.push(format!(
-            "The {:.0} % of the features of largest scale brought {reached} of {usable} photographs into the largest coarse \
-             model{}.",
-            selection.eta_percent,
-            if selection.widened().is_some() { "; a larger share was tried after that" } else { ", and these are all features" }
+            "{} brought {reached} of {usable} photographs into the largest coarse model{}.",
+            selection.described(),
+            if selection.widened().is_some() { "; more were tried after that" } else { "" }
         ));
     }
     let (models, account) = best.unwrap_or_default();

@@ -69,6 +69,11 @@ impl LookAlikeAccount {
     pub fn apart(&self) -> ApartImages {
         self.cut.iter().filter(|cut| cut.apart).map(|cut| cut.images).collect()
     }
+
+    /// Of the pairs put off, the share that is held apart; 0 where none was put off.
+    pub fn apart_share(&self) -> f64 {
+        self.cut.iter().filter(|cut| cut.apart).count() as f64 / self.suspected.max(1) as f64
+    }
 }
 
 /// Reconstructs as [`mapper::reconstruct`] does, without the pairs that join look-alikes.
