@@ -254,7 +254,7 @@ fn masked_places_give_no_features_and_leave_the_limit_to_others() {
 fn the_limit_grows_with_the_image_between_bounds() {
     let options = SiftOptions::default();
     assert_eq!(options.limit(640, 480), 12_000);
-    assert_eq!(options.limit(1000, 1500), 16_500);
+    assert_eq!(options.limit(1000, 1500), 24_000);
     assert_eq!(options.limit(4000, 3000), 26_624);
     assert_eq!(SiftOptions { max_features: 100, ..options }.limit(640, 480), 100);
 }
