@@ -104,12 +104,10 @@ impl SelectionOptions {
         let everything = self.eta_percent >= LAST_SHARE_PERCENT;
         Some(Self {
             eta_percent: if everything { 100.0 } else { (2.0 * self.eta_percent).min(100.0) },
-            all_below: self.all_below,
-            trial_max_features: None,
-            trial_from_images: self.trial_from_images,
-            trial_max_apart_share: self.trial_max_apart_share,
             min_features: 2 * self.min_features,
             max_features: if everything { None } else { self.max_features.map(|max| 2 * max) },
+            trial_max_features: None,
+            ..self.clone()
         })
     }
 }
