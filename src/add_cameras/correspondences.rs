@@ -78,15 +78,15 @@ mod tests {
     #[test]
     fn the_stronger_claim_stays() {
         let mut claims = OneToOne::default();
-        assert!(claims.claim(KeypointIdx(1), Point3dId(10), 1, 500));
-        assert!(!claims.claim(KeypointIdx(1), Point3dId(11), 1, 500), "no better");
-        assert!(claims.claim(KeypointIdx(2), Point3dId(11), 1, 100));
+        assert!(claims.claim(KeypointIdx(1), Point3dId::new(10), 1, 500));
+        assert!(!claims.claim(KeypointIdx(1), Point3dId::new(11), 1, 500), "no better");
+        assert!(claims.claim(KeypointIdx(2), Point3dId::new(11), 1, 100));
         // Nearer than what keypoint 1 has, but not than what point 11 has.
-        assert!(!claims.claim(KeypointIdx(1), Point3dId(11), 1, 200));
+        assert!(!claims.claim(KeypointIdx(1), Point3dId::new(11), 1, 200));
         // Stronger than both: takes both places.
-        assert!(claims.claim(KeypointIdx(1), Point3dId(11), 2, 400));
+        assert!(claims.claim(KeypointIdx(1), Point3dId::new(11), 2, 400));
         assert_eq!(claims.len(), 1);
-        assert!(!claims.has_point(Point3dId(10)));
-        assert_eq!(claims.into_sorted(), [Correspondence { keypoint: KeypointIdx(1), point: Point3dId(11) }]);
+        assert!(!claims.has_point(Point3dId::new(10)));
+        assert_eq!(claims.into_sorted(), [Correspondence { keypoint: KeypointIdx(1), point: Point3dId::new(11) }]);
     }
 }

@@ -8,14 +8,17 @@
 //! Where two keypoints of one image agree, the one with the smaller error is kept (the authors' code throws such a view
 //! away, the print is silent).
 
+use std::ops::Range;
+
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
+use super::components::Components;
 use super::options::TriangulationOptions;
-use super::triangulate::{StarTrack, refit};
+use super::stars::{Star, StarTracks};
+use super::triangulate::refit;
 use super::views::{Sighting, ViewTable};
 use super::{AddPointsError, Cancelled};
-use crate::math::UnionFind;
 use crate::scene::{ImageId, Observation, Point3dId, Reconstruction};
 
 /// What merging makes of a component: a new point, or a point of the model with a new position and track.
@@ -38,60 +41,32 @@ pub struct TrackUpdate {
 pub fn merge_tracks(
     model: &Reconstruction,
     table: &ViewTable,
-    stars: &[StarTrack],
+    stars: &StarTracks,
     options: &TriangulationOptions,
     cancelled: &Cancelled,
 ) -> Result<Vec<TrackUpdate>, AddPointsError> {
-    let components = connected_components(model, table, stars);
-    let resolve = |component: &Component| {
-        if cancelled() {
-            return Err(AddPointsError::Cancelled);
+    let components = Components::new(model, table, stars);
+    let resolve = |some: Range<usize>| {
+        let mut updates = Vec::new();
+        for component in some {
+            if cancelled() {
+                return Err(AddPointsError::Cancelled);
+            }
+            let (of_stars, points) = components.get(component);
+            updates.extend(Resolver::new(model, table, (stars, of_stars), points, options).run());
         }
-        Ok(Resolver::new(model, table, stars, component, options).run())
+        Ok(updates)
     };
-    let resolved: Vec<Vec<TrackUpdate>> = components.par_iter().map(resolve).collect::<Result<_, _>>()?;
-    Ok(resolved.into_iter().flatten().collect())
+    let starts: Vec<usize> = (0..components.len()).step_by(COMPONENTS_AT_ONCE).collect();
+    let runs = starts.into_par_iter().map(|start| start..components.len().min(start + COMPONENTS_AT_ONCE));
+    let resolved: Vec<Vec<TrackUpdate>> = runs.map(resolve).collect::<Result<_, _>>()?;
+    let mut updates = Vec::with_capacity(resolved.iter().map(Vec::len).sum());
+    updates.extend(resolved.into_iter().flatten());
+    Ok(updates)
 }
 
-/// Tracks and points that hang together by shared sightings.
-#[derive(Debug, Default)]
-struct Component {
-    stars: Vec<u32>,
-    points: Vec<Point3dId>,
-}
-
-/// The components with at least one track, by their first.
-fn connected_components(model: &Reconstruction, table: &ViewTable, stars: &[StarTrack]) -> Vec<Component> {
-    let mut sets = UnionFind::new(table.num_nodes());
-    let node_of = |observation: &Observation| table.node(table.sighting(observation));
-    for (_, point) in model.points() {
-        for pair in point.track.windows(2) {
-            sets.union(node_of(&pair[0]), node_of(&pair[1]));
-        }
-    }
-    for star in stars {
-        for pair in star.sightings.windows(2) {
-            sets.union(table.node(pair[0]), table.node(pair[1]));
-        }
-    }
-    let mut component_of_root: Vec<Option<u32>> = vec![None; table.num_nodes()];
-    let mut components: Vec<Component> = Vec::new();
-    for (index, star) in stars.iter().enumerate() {
-        let root = sets.find(table.node(star.sightings[0]));
-        let component = *component_of_root[root].get_or_insert_with(|| {
-            components.push(Component::default());
-            components.len() as u32 - 1
-        });
-        components[component as usize].stars.push(index as u32);
-    }
-    for (id, point) in model.points() {
-        let root = sets.find(node_of(&point.track[0]));
-        if let Some(component) = component_of_root[root] {
-            components[component as usize].points.push(id);
-        }
-    }
-    components
-}
+/// Components a thread takes at a time.
+const COMPONENTS_AT_ONCE: usize = 256;
 
 /// A sighting of a component and who holds it.
 #[derive(Clone, Copy, Debug)]
@@ -109,7 +84,7 @@ struct Resolver<'a> {
     table: &'a ViewTable<'a>,
     options: &'a TriangulationOptions,
     /// The best supported first.
-    stars: Vec<&'a StarTrack>,
+    stars: Vec<Star<'a>>,
     /// The longest track first.
     points: Vec<Point3dId>,
     /// All sightings, sorted.
@@ -120,11 +95,11 @@ impl<'a> Resolver<'a> {
     fn new(
         model: &'a Reconstruction,
         table: &'a ViewTable<'a>,
-        stars: &'a [StarTrack],
-        component: &Component,
+        (stars, of_component): (&'a StarTracks, &[u32]),
+        points: &[Point3dId],
         options: &'a TriangulationOptions,
     ) -> Self {
-        let mut stars: Vec<&StarTrack> = component.stars.iter().map(|&index| &stars[index as usize]).collect();
+        let mut stars: Vec<Star<'_>> = of_component.iter().map(|&at| stars.get(at as usize)).collect();
         let mut seen: Vec<Sighting> = stars.iter().flat_map(|star| star.sightings.iter().copied()).collect();
         stars.sort_by(|a, b| {
             let by_length = b.sightings.len().cmp(&a.sightings.len());
@@ -132,7 +107,7 @@ impl<'a> Resolver<'a> {
                 .then(b.distinctive.cmp(&a.distinctive))
                 .then(a.mean_relative_error_sq.total_cmp(&b.mean_relative_error_sq))
         });
-        let mut points = component.points.clone();
+        let mut points = points.to_vec();
         points.sort_by_key(|&id| (std::cmp::Reverse(track_of(model, id).len()), id));
         seen.extend(points.iter().flat_map(|&id| track_of(model, id)).map(|observation| table.sighting(observation)));
         seen.sort_unstable();
@@ -198,7 +173,7 @@ impl<'a> Resolver<'a> {
     }
 
     /// Makes a point of the free sightings that agree with a track's position.
-    fn make_point(&mut self, star: &StarTrack) -> Option<TrackUpdate> {
+    fn make_point(&mut self, star: Star<'_>) -> Option<TrackUpdate> {
         let free = |seen: &&Sighting| self.claim(**seen).is_some_and(|claim| !claim.taken && claim.owner.is_none());
         if star.sightings.iter().filter(free).count() < 2 {
             return None;
@@ -311,11 +286,11 @@ pub struct MergeCounts {
 }
 
 /// Brings the updates into the model, in their order. New points are black until somebody colours them.
-pub fn apply_updates(model: &mut Reconstruction, updates: &[TrackUpdate]) -> MergeCounts {
+pub fn apply_updates(model: &mut Reconstruction, updates: Vec<TrackUpdate>) -> MergeCounts {
     let mut counts = MergeCounts::default();
     for update in updates {
         let Some(id) = update.extends else {
-            model.add_point(update.xyz, update.track.clone(), [0; 3]);
+            model.add_point(update.xyz, update.track, [0; 3]);
             counts.created += 1;
             continue;
         };

@@ -8,7 +8,7 @@
 //! - [`candidate_search`], by [`grid`] (6.2.1, equations 4 to 9) or [`sweep`]: the features near that line, fast;
 //! - [`line_groups`] (6.2.2): features that share a line share the search;
 //! - [`guided_match`](mod@guided_match) (6.2.2, 6.2.3): best descriptor along the line, ratio test after the geometry;
-//! - [`triangulate`] (6.3): each image's matches as tracks, and their points;
+//! - [`triangulate`] (6.3): each image's matches as tracks, and their points, kept in little room ([`stars`]);
 //! - [`merge`] (6.3): the pieces of one point made one;
 //! - [`strays`]: points that rest on one match and lie where nothing else is, taken out at the end.
 //!
@@ -18,6 +18,7 @@
 
 pub mod candidate_pairs;
 pub mod candidate_search;
+mod components;
 pub mod epipolar;
 pub mod grid;
 pub mod guided_match;
@@ -28,6 +29,7 @@ mod options;
 pub mod pair_matcher;
 pub mod pencil;
 pub mod prepared;
+pub mod stars;
 pub mod strays;
 pub mod sweep;
 #[cfg(test)]
@@ -133,9 +135,10 @@ pub fn add_matches(
     let updates = {
         let table = views::ViewTable::new(model, &options.triangulation, &options.pixel_scaling);
         let stars = triangulate::star_tracks(model, &table, &matches, cancelled)?;
+        drop(matches);
         merge::merge_tracks(model, &table, &stars, &options.triangulation, cancelled)?
     };
-    let counts = merge::apply_updates(model, &updates);
+    let counts = merge::apply_updates(model, updates);
     report.points_created = counts.created;
     report.points_extended = counts.extended;
     report.points_absorbed = counts.absorbed;

@@ -234,14 +234,15 @@ impl PixelScaling {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BlockOptions {
-    /// Pairs are worked through in tiles of this many images by as many: at most twice this many images' features (about
-    /// 4 MB each) are in memory at a time. Smaller tiles read features more often.
+    /// Pairs are worked through in tiles of this many images by as many (or as there are threads, if more): at most twice this
+    /// many images' features (about 4 MB each) are in memory at a time. Smaller tiles read features more often: on 128 images of
+    /// 17,000 features 8 takes 2 % more CPU time than 64, and 120 MB less.
     pub images_per_block: usize,
 }
 
 impl Default for BlockOptions {
     fn default() -> Self {
-        Self { images_per_block: 64 }
+        Self { images_per_block: 8 }
     }
 }
 

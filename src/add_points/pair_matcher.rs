@@ -13,10 +13,11 @@ use super::{AddPointsError, Cancelled, CandidatePair, LoadFeatures};
 use crate::scene::{Features, ImageId, KeypointIdx, Reconstruction};
 
 /// The pairs in tiles of so many images by as many, each tile in one piece, so that images are prepared once a tile and memory
-/// does not grow with their number.
+/// does not grow with their number. A side is never shorter than there are threads, or some would often be without work.
 pub fn tiles(model: &Reconstruction, pairs: &[CandidatePair], blocks: &BlockOptions) -> Vec<Vec<CandidatePair>> {
     let rank_of: BTreeMap<ImageId, usize> = model.images().keys().enumerate().map(|(rank, &id)| (id, rank)).collect();
-    let tile = |id: &ImageId| rank_of.get(id).map(|rank| rank / blocks.images_per_block);
+    let side = blocks.images_per_block.max(rayon::current_num_threads());
+    let tile = |id: &ImageId| rank_of.get(id).map(|rank| rank / side);
     let mut tiles: BTreeMap<_, Vec<CandidatePair>> = BTreeMap::new();
     for pair in pairs {
         tiles.entry((tile(&pair.first), tile(&pair.second))).or_default().push(*pair);

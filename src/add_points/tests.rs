@@ -253,6 +253,7 @@ fn results_do_not_depend_on_threads_or_tiles() {
     };
     let one = run(1, 64);
     assert_eq!(one, run(4, 64));
+    assert_eq!(one, run(1, 1));
     assert_eq!(one, run(2, 1));
 }
 
@@ -352,7 +353,7 @@ fn triangulation_is_accurate_and_survives_a_wrong_match() {
 fn merged(scene: &TestScene, model: &Reconstruction, stars: &[Vec<(usize, usize)>]) -> Vec<merge::TrackUpdate> {
     let options = AddPointsOptions::default();
     let table = views::ViewTable::new(model, &options.triangulation, &options.pixel_scaling);
-    let stars: Vec<triangulate::StarTrack> = stars
+    let tracks: Vec<triangulate::StarTrack> = stars
         .iter()
         .map(|star| {
             let sight = |&(image, point): &(usize, usize)| {
@@ -367,6 +368,8 @@ fn merged(scene: &TestScene, model: &Reconstruction, stars: &[Vec<(usize, usize)
             }
         })
         .collect();
+    let mut stars = stars::StarTracks::default();
+    tracks.into_iter().for_each(|track| stars.add_image(vec![track]));
     merge::merge_tracks(model, &table, &stars, &options.triangulation, &|| false).unwrap()
 }
 
@@ -457,7 +460,7 @@ fn points_of_the_model_are_extended_and_joined() {
     let updates = merged(&scene, &model, &[vec![(1, p), (2, p)], vec![(4, p), (5, p)]]);
     assert_eq!(updates.len(), 1);
     assert_eq!((updates[0].extends, &updates[0].absorbs), (Some(long), &vec![short]));
-    let counts = merge::apply_updates(&mut model, &updates);
+    let counts = merge::apply_updates(&mut model, updates);
     assert_eq!((counts.created, counts.extended, counts.absorbed), (0, 1, 1));
     model.assert_consistent();
     assert_eq!((model.num_points(), model.point(long).unwrap().track.len()), (1, 6));

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::guided_match::KeypointMatch;
+use super::stars::StarTracks;
 use super::views::{Sighting, ViewTable};
 use super::{AddPointsError, Cancelled};
 use crate::geometry::triangulation::refine_point;
@@ -50,7 +51,7 @@ pub fn star_tracks(
     table: &ViewTable,
     matches: &[PairMatches],
     cancelled: &Cancelled,
-) -> Result<Vec<StarTrack>, AddPointsError> {
+) -> Result<StarTracks, AddPointsError> {
     // The pairs of each image, as (index of the pair, whether it is the pair's first).
     let mut pairs_of: Vec<Vec<(usize, bool)>> = vec![Vec::new(); table.len()];
     for (index, pair) in matches.iter().enumerate() {
@@ -65,9 +66,17 @@ pub fn star_tracks(
         }
         Ok(stars_of_image(model, table, matches, rank as u32, &pairs_of[rank]))
     };
-    let stars: Vec<Vec<StarTrack>> = (0..table.len()).into_par_iter().map(of_image).collect::<Result<_, _>>()?;
-    Ok(stars.into_iter().flatten().collect())
+    let mut stars = StarTracks::default();
+    let ranks: Vec<usize> = (0..table.len()).collect();
+    for some in ranks.chunks(IMAGES_PER_THREAD * rayon::current_num_threads()) {
+        let found: Vec<Vec<StarTrack>> = some.par_iter().map(|&rank| of_image(rank)).collect::<Result<_, _>>()?;
+        found.into_iter().for_each(|of_image| stars.add_image(of_image));
+    }
+    Ok(stars)
 }
+
+/// Images whose stars are found before they are packed, for each thread: enough for threads to be seldom without work.
+const IMAGES_PER_THREAD: usize = 4;
 
 fn stars_of_image(
     model: &Reconstruction,

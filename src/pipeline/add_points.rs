@@ -64,7 +64,8 @@ impl PointAdder<'_> {
             progress.set((done.fetch_add(count, Ordering::Relaxed) + count) as u64, pairs.len() as u64);
         };
         let cancelled = || self.context.cancel.is_cancelled();
-        let features = |id: ImageId| -> Arc<Features> { self.cache.get(id) };
+        // The matcher keeps them while it needs them.
+        let features = |id: ImageId| -> Arc<Features> { Arc::new(self.cache.read(id, None)) };
         let mut matcher = PairMatcher::new(model, &features, self.options, self.context.seed);
         let mut matches: Vec<PairMatches> = Vec::with_capacity(pairs.len());
         let mut reused = 0;

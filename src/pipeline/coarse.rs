@@ -42,7 +42,7 @@ const POSITION_CACHE_BYTES: usize = 64 << 20;
 ///
 /// A selection takes over the pairs among the images of the largest model so far. Not so after the trial: where its few
 /// features leave images out, they hold the others together but weakly, too, and a street of 29 photographs went astray at
-/// such joins. So the selection after it starts anew. And where the trial finds look-alikes, it isn't trusted to tell them apart.
+/// such joins. And where the trial finds look-alikes, it isn't trusted to tell them apart. So a trial is taken or forgotten.
 pub fn run(
     runner: &mut Runner<'_>,
     intake: &Intake,
@@ -56,17 +56,13 @@ pub fn run(
     let mut best: Option<(CoarseModels, LookAlikeAccount)> = None;
     let mut before = CoarseMatches::default();
     let full = &options.coarse.selection;
-    let trial = full.trial(usable);
+    let trial = full.trial(usable).map(|selection| (selection, true));
     let selections = std::iter::successors(Some(full.clone()), SelectionOptions::widened);
-    for (round, selection) in (1u32..).zip(trial.clone().into_iter().chain(selections)) {
+    let tries = trial.into_iter().chain(selections.map(|selection| (selection, false)));
+    for (round, (selection, is_trial)) in (1u32..).zip(tries) {
         let iteration = (round > 1).then_some(round);
-        let is_trial_over = trial.is_some() && selection == *full;
-        if is_trial_over {
-            before = CoarseMatches::default();
-        }
         let settled = best
             .as_ref()
-            .filter(|_| !is_trial_over)
             .and_then(|(models, _)| models.models.first())
             .map(|model| model.images().keys().copied().collect());
         let match_key = ArtifactKey::of("coarse_match", &[&base_key.0, &selection]);
@@ -119,12 +115,6 @@ pub fn run(
                 ]);
                 Ok(((models, account), totals))
             })?;
-        for note in &matches.notes {
-            if !notes.contains(note) {
-                notes.push(note.clone());
-            }
-        }
-        let is_trial = trial.as_ref() == Some(&selection);
         if is_trial && account.apart_share() > full.trial_max_apart_share {
             notes.push(
                 "Some photographs show different places that look alike: more features were matched to tell them apart."
@@ -134,14 +124,30 @@ pub fn run(
         }
         let largest = |models: &CoarseModels| models.models.first().map_or(0, |model| model.images().len());
         let reached = largest(&models);
+        let is_enough = reached as f64 >= options.coarse.enough_registered * usable as f64;
+        let is_flat = reached == 0 && matches.graph.degrees().len() == usable && matches.graph.is_flat();
+        let fell_short = format!(
+            "{} brought {reached} of {usable} photographs into the largest coarse model{}.",
+            selection.described(),
+            if selection.widened().is_some() { "; more were tried after that" } else { "" }
+        );
+        if is_trial && !is_enough && !is_flat {
+            notes.push(fell_short);
+            continue;
+        }
+        for note in &matches.notes {
+            if !notes.contains(note) {
+                notes.push(note.clone());
+            }
+        }
         if best.as_ref().is_none_or(|(best, _)| (reached, registered(&models)) > (largest(best), registered(best))) {
             best = Some((models, account));
         }
         before = matches;
-        if reached as f64 >= options.coarse.enough_registered * usable as f64 {
+        if is_enough {
             break;
         }
-        if reached == 0 && before.graph.degrees().len() == usable && before.graph.is_flat() {
+        if is_flat {
             notes.push(
                 "All photographs match others, but as if the camera had only been turned: no two show depth. Where an object \
                  was turned in front of a still background, mask the background (masks/<name>.png, 0 where a picture is to \
@@ -150,11 +156,7 @@ pub fn run(
             );
             break;
         }
-        notes.push(format!(
-            "{} brought {reached} of {usable} photographs into the largest coarse model{}.",
-            selection.described(),
-            if selection.widened().is_some() { "; more were tried after that" } else { "" }
-        ));
+        notes.push(fell_short);
     }
     let (models, account) = best.unwrap_or_default();
     notes.extend(look_alike_note(&account, intake));

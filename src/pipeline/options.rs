@@ -125,8 +125,8 @@ pub struct CoarseOptions {
     pub look_alikes: LookAlikeOptions,
     /// Incremental structure from motion.
     pub mapper: MapperOptions,
-    /// Share of the readable images that must come into the largest model for the selection to stay as it is; below, it is
-    /// widened (to 40 %, then to all features).
+    /// Share of the readable images that must come into the largest model for the selection to stay as it is; below, a trial
+    /// is forgotten, and another selection widened (to 40 %, then to all features).
     pub enough_registered: f64,
 }
 

@@ -21,7 +21,7 @@ use crate::store::ArtifactStore;
 pub type Counts = BTreeMap<String, f64>;
 
 /// Changes whenever stored stage results of an earlier build must not be re-used.
-const FORMAT_VERSION: u32 = 3;
+const FORMAT_VERSION: u32 = 4;
 
 /// The key a stage's result is stored under.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -143,7 +143,7 @@ impl<'a> Runner<'a> {
                 let progress = StageProgress { context: self.context, stage, total, state: Mutex::new((0, 0)) };
                 let outcome = work(&self.store, &progress)?;
                 if let Some(key) = key {
-                    let bytes = postcard::to_stdvec(&outcome).expect("stage results serialise");
+                    let bytes = to_bytes(&outcome);
                     self.store
                         .put(&key.0, &bytes)
                         .map_err(|source| io_error(stage.stage, Path::new(&key.0), source))?;
@@ -173,6 +173,14 @@ impl<'a> Runner<'a> {
         });
         Ok(result)
     }
+}
+
+/// The bytes of a stage's result or of a unit of its work, in a block of just their size: a block that grows takes twice as much
+/// for models of tens of megabytes.
+pub(super) fn to_bytes<T: Serialize + ?Sized>(value: &T) -> Vec<u8> {
+    let size = postcard::serialize_with_flavor(value, postcard::ser_flavors::Size::default());
+    let bytes = Vec::with_capacity(size.expect("plain data serialises"));
+    postcard::to_extend(value, bytes).expect("plain data serialises")
 }
 
 /// The I/O error of a path during a stage.

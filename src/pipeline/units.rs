@@ -11,7 +11,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::runner::erased::Part;
-use super::runner::{ArtifactKey, io_error};
+use super::runner::{ArtifactKey, io_error, to_bytes};
 use super::{PipelineError, Stage};
 use crate::store::ArtifactStore;
 
@@ -63,8 +63,7 @@ impl<'a> Units<'a> {
     /// When it can't be stored.
     pub fn keep<T: Serialize + ?Sized>(&self, unit: &dyn Part, found: &T) -> Result<(), PipelineError> {
         let key = self.key(unit);
-        let bytes = postcard::to_stdvec(found).expect("units serialise");
-        self.store.put(&key, &bytes).map_err(|source| io_error(self.stage, Path::new(&key), source))
+        self.store.put(&key, &to_bytes(found)).map_err(|source| io_error(self.stage, Path::new(&key), source))
     }
 
     /// Removes all of them.

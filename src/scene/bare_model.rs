@@ -48,7 +48,7 @@ impl<'a> BareModel<'a> {
         }
         model.points = self.points.into_owned();
         model.num_points = model.points.iter().flatten().count();
-        for (id, point) in (0..).map(super::Point3dId).zip(&model.points) {
+        for (id, point) in (0..).map(super::Point3dId::new).zip(&model.points) {
             for &Observation { image, keypoint } in point.iter().flat_map(|point| &point.track) {
                 let slot = model.images.get_mut(&image)?.points.get_mut(keypoint.index())?;
                 if slot.replace(id).is_some() {

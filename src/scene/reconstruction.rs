@@ -156,7 +156,7 @@ impl Reconstruction {
 
     /// All points, in id order.
     pub fn points(&self) -> impl Iterator<Item = (Point3dId, &Point3d)> {
-        (0u32..).map(Point3dId).zip(&self.points).filter_map(|(id, point)| Some((id, point.as_ref()?)))
+        (0..).map(Point3dId::new).zip(&self.points).filter_map(|(id, point)| Some((id, point.as_ref()?)))
     }
 
     /// Adds a point with its sightings and returns its id.
@@ -166,7 +166,7 @@ impl Reconstruction {
     pub fn add_point(&mut self, xyz: Vector3<f64>, mut track: Vec<Observation>, color: [u8; 3]) -> Point3dId {
         track.sort_unstable();
         assert!(track.windows(2).all(|pair| pair[0].image != pair[1].image), "a track sees an image twice");
-        let id = Point3dId(self.points.len() as u32);
+        let id = Point3dId::new(self.points.len());
         for observation in &track {
             let slot = &mut self.image_mut(observation.image).points[observation.keypoint.index()];
             assert!(slot.is_none(), "{observation:?} already sees a point");

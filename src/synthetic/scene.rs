@@ -182,7 +182,7 @@ pub fn perturbed(
         model.set_pose(id, Rigid3::from_center(turn * image.cam_from_world.rotation, &center));
     }
     for (id, point) in truth.points() {
-        model.set_xyz(id, point.xyz + direction(&mut stream(1, id.0)) * (share * spread));
+        model.set_xyz(id, point.xyz + direction(&mut stream(1, id.index() as u32)) * (share * spread));
     }
     for (id, camera) in &mut model.cameras {
         let sign = if stream(2, id.0).uniform() < 0.5 { -1.0 } else { 1.0 };

@@ -60,7 +60,7 @@ pub fn write_images_bin<'a>(
         out.write_all(&(image.keypoints.len() as u64).to_le_bytes())?;
         for (keypoint, point) in image.keypoints.iter().zip(image.points()) {
             write_f64s(out, keypoint.0.as_slice())?;
-            let point_id = point.map_or(NO_POINT, |id| u64::from(id.0) + 1);
+            let point_id = point.map_or(NO_POINT, |id| id.index() as u64 + 1);
             out.write_all(&point_id.to_le_bytes())?;
         }
     }
@@ -74,7 +74,7 @@ pub fn write_images_bin<'a>(
 pub fn write_points3d_bin(model: &Reconstruction, out: &mut impl Write) -> io::Result<()> {
     out.write_all(&(model.num_points() as u64).to_le_bytes())?;
     for (id, point) in model.points() {
-        out.write_all(&(u64::from(id.0) + 1).to_le_bytes())?;
+        out.write_all(&(id.index() as u64 + 1).to_le_bytes())?;
         write_f64s(out, point.xyz.as_slice())?;
         out.write_all(&point.color)?;
         write_f64s(out, &[mean_error_px(model, id, point)])?;

@@ -52,7 +52,7 @@ pub fn write_images_txt<'a>(
         for (keypoint, point) in image.keypoints.iter().zip(image.points()) {
             write!(out, "{blank}{} {} ", keypoint.0.x, keypoint.0.y)?;
             match point {
-                Some(id) => write!(out, "{}", u64::from(id.0) + 1)?,
+                Some(id) => write!(out, "{}", id.index() as u64 + 1)?,
                 None => write!(out, "-1")?,
             }
             blank = " ";
@@ -70,7 +70,7 @@ pub fn write_points3d_txt(model: &Reconstruction, out: &mut impl Write) -> io::R
     writeln!(out, "# One point a line: POINT3D_ID X Y Z R G B ERROR (IMAGE_ID POINT2D_IDX)[]")?;
     for (id, point) in model.points() {
         let (xyz, [r, g, b]) = (point.xyz, point.color);
-        write!(out, "{} {} {} {} {r} {g} {b}", u64::from(id.0) + 1, xyz.x, xyz.y, xyz.z)?;
+        write!(out, "{} {} {} {} {r} {g} {b}", id.index() as u64 + 1, xyz.x, xyz.y, xyz.z)?;
         write!(out, " {}", mean_error_px(model, id, point))?;
         for seen in &point.track {
             write!(out, " {} {}", seen.image.0 + 1, seen.keypoint.0)?;

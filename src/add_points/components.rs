@@ -1,0 +1,80 @@
+//! Which tracks and points of the model hang together: they share sightings, at once or by way of others (paper, section 6.3).
+
+use std::collections::HashMap;
+
+use super::stars::StarTracks;
+use super::views::ViewTable;
+use crate::math::UnionFind;
+use crate::scene::{Observation, Point3dId, Reconstruction};
+
+/// The components with at least one track, in the order of their first.
+pub struct Components {
+    stars: Grouped<u32>,
+    points: Grouped<Point3dId>,
+}
+
+impl Components {
+    /// Of these tracks and the points of the model.
+    pub fn new(model: &Reconstruction, table: &ViewTable, stars: &StarTracks) -> Self {
+        let mut sets = UnionFind::new(table.num_nodes());
+        let node_of = |observation: &Observation| table.node(table.sighting(observation));
+        for (_, point) in model.points() {
+            for pair in point.track.windows(2) {
+                sets.union(node_of(&pair[0]), node_of(&pair[1]));
+            }
+        }
+        for star in stars.iter() {
+            for pair in star.sightings.windows(2) {
+                sets.union(table.node(pair[0]), table.node(pair[1]));
+            }
+        }
+        let mut of_root: HashMap<usize, u32> = HashMap::new();
+        let of_stars = (0u32..).zip(stars.iter()).map(|(at, star)| {
+            let next = of_root.len() as u32;
+            (*of_root.entry(sets.find(table.node(star.sightings[0]))).or_insert(next), at)
+        });
+        let of_stars: Vec<(u32, u32)> = of_stars.collect();
+        let of_points = model.points().filter_map(|(id, point)| {
+            let component = of_root.get(&sets.find(node_of(&point.track[0])))?;
+            Some((*component, id))
+        });
+        let of_points: Vec<(u32, Point3dId)> = of_points.collect();
+        let count = of_root.len();
+        Self { stars: Grouped::new(count, of_stars), points: Grouped::new(count, of_points) }
+    }
+
+    /// How many.
+    pub fn len(&self) -> usize {
+        self.stars.starts.len() - 1
+    }
+
+    /// The numbers of a component's tracks and the ids of its points, both ascending.
+    pub fn get(&self, component: usize) -> (&[u32], &[Point3dId]) {
+        (self.stars.group(component), self.points.group(component))
+    }
+}
+
+/// Items by their groups, one after the other.
+struct Grouped<T> {
+    /// Group g is `items[starts[g]..starts[g + 1]]`.
+    starts: Vec<u32>,
+    items: Vec<T>,
+}
+
+impl<T: Ord> Grouped<T> {
+    fn new(count: usize, mut grouped: Vec<(u32, T)>) -> Self {
+        grouped.sort_unstable();
+        let mut starts = vec![0; count + 1];
+        for (group, _) in &grouped {
+            starts[*group as usize + 1] += 1;
+        }
+        for at in 0..count {
+            starts[at + 1] += starts[at];
+        }
+        Self { starts, items: grouped.into_iter().map(|(_, item)| item).collect() }
+    }
+
+    fn group(&self, group: usize) -> &[T] {
+        &self.items[self.starts[group] as usize..self.starts[group + 1] as usize]
+    }
+}
