@@ -85,37 +85,68 @@ pub(super) fn extend_border(values: &mut [f32], margin: usize, width: usize) {
     values[margin + width..].fill(last);
 }
 
+/// Weighted sums of the rows `around` each of the rows `outs`; `weights` has [`BATCH`] - 1 zeros before and after.
+///
+/// The sums of a piece of the rows must fit the registers beside the values loaded: 32 registers of 16 floats hold pieces of 32,
+/// 16 registers of 8 floats pieces of 16 (with 32 the compiler stores and loads sums within the loop, at twice the time).
+fn blur_columns(isa: Isa, weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH]) {
+    if isa.has_many_registers() {
+        blur_columns_wide(isa, weights, around, outs);
+    } else {
+        blur_columns_narrow(isa, weights, around, outs);
+    }
+}
+
 stamp!(
-    /// Weighted sums of the rows `around` each of the rows `outs`; `weights` has [`BATCH`] - 1 zeros before and after.
-    blur_columns => blur_columns_body(weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH])
+    /// [`blur_columns`] in pieces of 32.
+    blur_columns_wide => blur_columns_wide_body(weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH])
+);
+
+stamp!(
+    /// [`blur_columns`] in pieces of 16.
+    blur_columns_narrow => blur_columns_narrow_body(weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH])
 );
 
 #[inline(always)]
-fn blur_columns_body<const FMA: bool>(weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH]) {
+fn blur_columns_wide_body<const FMA: bool>(weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH]) {
+    blur_columns_body::<FMA, BLOCK>(weights, around, outs);
+}
+
+#[inline(always)]
+fn blur_columns_narrow_body<const FMA: bool>(weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH]) {
+    blur_columns_body::<FMA, { BLOCK / 2 }>(weights, around, outs);
+}
+
+#[inline(always)]
+fn blur_columns_body<const FMA: bool, const PIECE: usize>(
+    weights: &[f32],
+    around: &[&[f32]],
+    outs: [&mut [f32]; BATCH],
+) {
     let [out_0, out_1, out_2, out_3] = outs;
-    for start in (0..out_0.len()).step_by(BLOCK) {
+    for start in (0..out_0.len()).step_by(PIECE) {
         // Four arrays by name, not an array of arrays: the compiler keeps only these in registers.
-        let (mut sum_0, mut sum_1) = ([0.0_f32; BLOCK], [0.0_f32; BLOCK]);
-        let (mut sum_2, mut sum_3) = ([0.0_f32; BLOCK], [0.0_f32; BLOCK]);
+        let (mut sum_0, mut sum_1) = ([0.0_f32; PIECE], [0.0_f32; PIECE]);
+        let (mut sum_2, mut sum_3) = ([0.0_f32; PIECE], [0.0_f32; PIECE]);
         for (row, weights) in around.iter().zip(weights.windows(BATCH)) {
-            let row = &row[start..start + BLOCK];
-            for i in 0..BLOCK {
+            let row = &row[start..start + PIECE];
+            for i in 0..PIECE {
                 sum_0[i] = mul_add::<FMA>(weights[3], row[i], sum_0[i]);
             }
-            for i in 0..BLOCK {
+            for i in 0..PIECE {
                 sum_1[i] = mul_add::<FMA>(weights[2], row[i], sum_1[i]);
             }
-            for i in 0..BLOCK {
+            for i in 0..PIECE {
                 sum_2[i] = mul_add::<FMA>(weights[1], row[i], sum_2[i]);
             }
-            for i in 0..BLOCK {
+            for i in 0..PIECE {
                 sum_3[i] = mul_add::<FMA>(weights[0], row[i], sum_3[i]);
             }
         }
-        out_0[start..start + BLOCK].copy_from_slice(&sum_0);
-        out_1[start..start + BLOCK].copy_from_slice(&sum_1);
-        out_2[start..start + BLOCK].copy_from_slice(&sum_2);
-        out_3[start..start + BLOCK].copy_from_slice(&sum_3);
+        out_0[start..start + PIECE].copy_from_slice(&sum_0);
+        out_1[start..start + PIECE].copy_from_slice(&sum_1);
+        out_2[start..start + PIECE].copy_from_slice(&sum_2);
+        out_3[start..start + PIECE].copy_from_slice(&sum_3);
     }
 }
 

@@ -30,6 +30,17 @@ impl Isa {
         Self(Level::Portable)
     }
 
+    /// Whether there are 32 registers of the set's widest vectors, not 16.
+    pub(super) fn has_many_registers(self) -> bool {
+        match self.0 {
+            Level::Portable => cfg!(target_arch = "aarch64"),
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => false,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => true,
+        }
+    }
+
     /// Every set of this processor, the portable one first.
     #[cfg(test)]
     pub(super) fn available() -> Vec<Self> {

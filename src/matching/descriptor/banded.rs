@@ -11,7 +11,7 @@
 use std::ops::Range;
 
 use super::kernel::{Kernel, PADDING_LIMIT, Running, block, reduce};
-use super::packed::{GROUP_ROWS, PADDING_BIAS, PackedDescriptors, QUADS};
+use super::packed::{GROUP_ROWS, PADDING_BIAS, PackedDescriptors};
 use super::tier::Tier;
 use crate::scene::Descriptor;
 
@@ -118,7 +118,6 @@ pub(super) unsafe fn scan<K: Kernel, const Q: usize>(
         return;
     }
     let per_query = windows.len() / queries.len();
-    let (lines, _) = rows.packed.lines.as_chunks::<QUADS>();
     let (biases, _) = rows.packed.biases.as_chunks::<GROUP_ROWS>();
     let ((xs, _), (ys, _)) = (rows.x.as_chunks::<GROUP_ROWS>(), rows.y.as_chunks::<GROUP_ROWS>());
     for first in (0..queries.len()).step_by(Q) {
@@ -140,7 +139,7 @@ pub(super) unsafe fn scan<K: Kernel, const Q: usize>(
                 let Some(joined) = joined else { continue };
                 for group in joined.start.max(scanned_to)..joined.end {
                     let at = group as usize;
-                    let dots = K::dots::<Q, 1>(&prepared, std::array::from_ref(&lines[at]));
+                    let dots = K::dots::<Q, 1>(&prepared, &[rows.packed.group(at)]);
                     let (biases, group) = (K::load(&biases[at]), K::splat(group as i32));
                     for q in 0..Q {
                         let near = K::near(&bands[q].line, bands[q].half_width, &xs[at], &ys[at]);
@@ -179,7 +178,6 @@ pub(super) unsafe fn scan_off<K: Kernel, const Q: usize>(
     out: &mut Vec<Option<u32>>,
 ) {
     out.clear();
-    let (lines, _) = rows.packed.lines.as_chunks::<QUADS>();
     let (biases, _) = rows.packed.biases.as_chunks::<GROUP_ROWS>();
     let ((xs, _), (ys, _)) = (rows.x.as_chunks::<GROUP_ROWS>(), rows.y.as_chunks::<GROUP_ROWS>());
     for first in (0..queries.len()).step_by(Q) {
@@ -190,8 +188,8 @@ pub(super) unsafe fn scan_off<K: Kernel, const Q: usize>(
         unsafe {
             let padding = K::splat(PADDING_BIAS);
             let mut nearest = [padding; Q];
-            for at in 0..lines.len() {
-                let dots = K::dots::<Q, 1>(&prepared, std::array::from_ref(&lines[at]));
+            for at in 0..rows.packed.num_groups() {
+                let dots = K::dots::<Q, 1>(&prepared, &[rows.packed.group(at)]);
                 let biases = K::load(&biases[at]);
                 let slots = K::load(&std::array::from_fn(|lane| (at * GROUP_ROWS + lane) as i32));
                 for q in 0..Q {

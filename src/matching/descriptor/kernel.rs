@@ -9,7 +9,7 @@
 //! distances, and the final reduction takes the lowest index among equal lanes.
 
 use super::Top2;
-use super::packed::{GROUP_ROWS, Line, PADDING_BIAS, PackedDescriptors, QUADS, norm_sq};
+use super::packed::{GROUP_ROWS, Group, PADDING_BIAS, PackedDescriptors, norm_sq};
 use crate::scene::{DESCRIPTOR_LEN, Descriptor};
 
 /// Groups in a chunk: 64 * 2 KiB = 128 KiB of rows.
@@ -33,7 +33,7 @@ pub(super) unsafe trait Kernel {
     /// `(q - o) . v` of every query with every row of the groups.
     unsafe fn dots<const Q: usize, const G: usize>(
         queries: &[Self::Query; Q],
-        groups: &[[Line; QUADS]; G],
+        groups: &[Group<'_>; G],
     ) -> [[Self::Lanes; G]; Q];
 
     unsafe fn splat(value: i32) -> Self::Lanes;
@@ -176,27 +176,25 @@ unsafe fn scan_block<K: Kernel, const Q: usize, const G: usize>(
     groups: std::ops::Range<usize>,
     mut rows: Option<&mut RowStates>,
 ) -> [Top2; Q] {
-    let (lines, _) = packed.lines.as_chunks::<QUADS>();
     let (biases, _) = packed.biases.as_chunks::<GROUP_ROWS>();
     // SAFETY: the caller vouches for the instructions of `K`; everything else is safe.
     unsafe {
         let padding = K::splat(PADDING_BIAS);
         let mut running = [Running { best: padding, second: padding, group: K::splat(0) }; Q];
-        let (tiles, rest) = lines[groups.clone()].as_chunks::<G>();
         let mut at = groups.start;
-        for tile in tiles {
-            let dots = K::dots::<Q, G>(prepared, tile);
+        while at + G <= groups.end {
+            let tile: [Group<'_>; G] = std::array::from_fn(|g| packed.group(at + g));
+            let dots = K::dots::<Q, G>(prepared, &tile);
             let columns: [[K::Lanes; Q]; G] = std::array::from_fn(|g| std::array::from_fn(|q| dots[q][g]));
             for column in columns {
                 update::<K, Q>(&column, norms_sq, first_query, &biases[at], at, &mut running, rows.as_deref_mut());
                 at += 1;
             }
         }
-        for group in rest {
-            let dots = K::dots::<Q, 1>(prepared, std::array::from_ref(group));
+        for at in at..groups.end {
+            let dots = K::dots::<Q, 1>(prepared, &[packed.group(at)]);
             let column = std::array::from_fn(|q| dots[q][0]);
             update::<K, Q>(&column, norms_sq, first_query, &biases[at], at, &mut running, rows.as_deref_mut());
-            at += 1;
         }
         std::array::from_fn(|q| reduce::<K>(&running[q]))
     }

@@ -4,7 +4,7 @@
 use std::arch::aarch64::*;
 
 use super::kernel::Kernel;
-use super::packed::{GROUP_ROWS, Line, QUADS};
+use super::packed::{GROUP_ROWS, Group, QUADS};
 use crate::scene::Descriptor;
 
 /// 128-bit vectors, part of every 64-bit Arm processor.
@@ -24,7 +24,7 @@ unsafe impl Kernel for Neon {
     #[inline(always)]
     unsafe fn dots<const Q: usize, const G: usize>(
         queries: &[Self::Query; Q],
-        groups: &[[Line; QUADS]; G],
+        groups: &[Group<'_>; G],
     ) -> [[Self::Lanes; G]; Q] {
         // SAFETY: a line is four times 16 bytes.
         unsafe {
@@ -34,7 +34,7 @@ unsafe impl Kernel for Neon {
                 for quarter in 0..4 {
                     let mut sums = [[vdupq_n_u32(0); 2]; Q];
                     for quad in 0..QUADS {
-                        let line: *const u8 = (&raw const groups[g][quad]).cast();
+                        let line: *const u8 = (&raw const groups[g].lines[quad]).cast();
                         let rows = vld1q_u8(line.add(16 * quarter));
                         for q in 0..Q {
                             let query = vreinterpret_u8_u32(vdup_n_u32(queries[q][quad]));

@@ -17,6 +17,44 @@ pub(super) const PADDING_BIAS: i32 = 1 << 29;
 #[repr(C, align(64))]
 pub(super) struct Line(pub(super) [[u8; 4]; GROUP_ROWS]);
 
+/// What the kernel of AVX2 must know of a group to multiply bytes with sums of 16 bits (see `x86::Avx2`).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct ShortSums {
+    /// For every row `(128 - SHORT_OFFSET)` times the sum of its bytes.
+    pub(super) shifts: [i32; GROUP_ROWS],
+    /// The largest sum of four bytes of a row whose products are added up in 16 bits.
+    pub(super) most: i32,
+}
+
+/// What is taken from a query's bytes for sums of 16 bits: half of what few of them exceed.
+pub(super) const SHORT_OFFSET: u8 = 64;
+
+impl ShortSums {
+    /// Of the rows of a group, of which `most` is known.
+    #[inline(always)]
+    pub(super) fn new(rows: &[&Descriptor; GROUP_ROWS], most: i32) -> Self {
+        let weight = i32::from(QUERY_OFFSET) - i32::from(SHORT_OFFSET);
+        Self { shifts: rows.map(|row| weight * sum(row)), most }
+    }
+
+    /// Of the rows of a group.
+    fn of(rows: &[&Descriptor; GROUP_ROWS]) -> Self {
+        let eights = rows.iter().flat_map(|row| row.as_chunks::<8>().0);
+        let sums =
+            eights.flat_map(|eight| [0, 2].map(|at| [at, at + 1, at + 4, at + 5].map(|at| i32::from(eight[at]))));
+        Self::new(rows, sums.map(|four| four.iter().sum()).max().unwrap_or(0))
+    }
+}
+
+/// A group of rows as the kernels take it.
+#[derive(Clone, Copy)]
+pub(super) struct Group<'a> {
+    /// Its quads.
+    pub(super) lines: &'a [Line; QUADS],
+    /// Used where bytes are multiplied with sums of 16 bits.
+    pub(super) short: &'a ShortSums,
+}
+
 /// Descriptors laid out for the kernels: groups of 16 rows; in a group 32 lines, one for each run of four bytes; in a line
 /// these four bytes of each of the 16 rows.
 ///
@@ -26,6 +64,8 @@ pub struct PackedDescriptors {
     pub(super) lines: Vec<Line>,
     /// For every row, padding included, the bias of the module's formula.
     pub(super) biases: Vec<i32>,
+    /// Of every group.
+    short: Vec<ShortSums>,
     len: usize,
 }
 
@@ -88,10 +128,17 @@ impl PackedDescriptors {
         self.biases.len() / GROUP_ROWS
     }
 
+    /// Group `at`.
+    #[inline(always)]
+    pub(super) fn group(&self, at: usize) -> Group<'_> {
+        Group { lines: &self.lines.as_chunks().0[at], short: &self.short[at] }
+    }
+
     fn fill<'a>(&mut self, len: usize, descriptor: impl Fn(usize) -> &'a Descriptor) {
         self.len = 0;
         self.lines.clear();
         self.biases.clear();
+        self.short.clear();
         self.append(len, descriptor);
     }
 
@@ -102,24 +149,28 @@ impl PackedDescriptors {
             let rows: [&Descriptor; GROUP_ROWS] =
                 std::array::from_fn(|lane| if first + lane < len { descriptor(first + lane) } else { &EMPTY });
             let (mut lines, mut biases) = ([Line([[0; 4]; GROUP_ROWS]); QUADS], [0; GROUP_ROWS]);
-            pack_group(&rows, &mut lines, &mut biases);
+            let short = pack_group(&rows, &mut lines, &mut biases);
             biases[(len - first).min(GROUP_ROWS)..].fill(PADDING_BIAS);
             self.lines.extend_from_slice(&lines);
             self.biases.extend_from_slice(&biases);
+            self.short.push(short);
         }
     }
 }
 
-/// The lines and biases of sixteen rows, with the fastest instructions of this machine.
+/// The lines, biases and the rest of sixteen rows, with the fastest instructions of this machine.
 #[inline]
-fn pack_group(rows: &[&Descriptor; GROUP_ROWS], lines: &mut [Line; QUADS], biases: &mut [i32; GROUP_ROWS]) {
+fn pack_group(
+    rows: &[&Descriptor; GROUP_ROWS],
+    lines: &mut [Line; QUADS],
+    biases: &mut [i32; GROUP_ROWS],
+) -> ShortSums {
     #[cfg(target_arch = "x86_64")]
     if std::is_x86_feature_detected!("avx2") {
         // SAFETY: the instructions are there.
-        unsafe { super::x86::pack_group(rows, lines, biases) };
-        return;
+        return unsafe { super::x86::pack_group(rows, lines, biases) };
     }
-    pack_group_plainly(rows, lines, biases);
+    pack_group_plainly(rows, lines, biases)
 }
 
 /// [`pack_group`] without special instructions.
@@ -127,12 +178,13 @@ pub(super) fn pack_group_plainly(
     rows: &[&Descriptor; GROUP_ROWS],
     lines: &mut [Line; QUADS],
     biases: &mut [i32; GROUP_ROWS],
-) {
+) -> ShortSums {
     for (quad, line) in lines.iter_mut().enumerate() {
         let at = 4 * quad;
         *line = Line(rows.map(|row| [row[at], row[at + 1], row[at + 2], row[at + 3]]));
     }
     *biases = rows.map(bias);
+    ShortSums::of(rows)
 }
 
 /// Squared length of a descriptor. At most 128 * 255^2, so wrapping never happens; saying so keeps the loop free of checks.
@@ -146,6 +198,10 @@ pub(super) fn norm_sq(descriptor: &Descriptor) -> i32 {
 /// The bias of the module's formula.
 #[inline(always)]
 pub(super) fn bias(row: &Descriptor) -> i32 {
-    let sum = row.iter().fold(0, |sum, &byte| i32::wrapping_add(sum, byte.into()));
-    norm_sq(row) - 2 * i32::from(QUERY_OFFSET) * sum
+    norm_sq(row) - 2 * i32::from(QUERY_OFFSET) * sum(row)
+}
+
+#[inline(always)]
+fn sum(row: &Descriptor) -> i32 {
+    row.iter().fold(0, |sum, &byte| i32::wrapping_add(sum, byte.into()))
 }

@@ -2,7 +2,7 @@
 
 use super::distance_sq;
 use super::kernel::Kernel;
-use super::packed::{GROUP_ROWS, Line, QUADS, QUERY_OFFSET};
+use super::packed::{GROUP_ROWS, Group, QUADS, QUERY_OFFSET};
 use crate::scene::Descriptor;
 
 /// [`super::least_distance_sq`] in ordinary arithmetic, which the compiler turns into what the caller was compiled for.
@@ -29,12 +29,12 @@ unsafe impl Kernel for Scalar {
     #[inline(always)]
     unsafe fn dots<const Q: usize, const G: usize>(
         queries: &[Self::Query; Q],
-        groups: &[[Line; QUADS]; G],
+        groups: &[Group<'_>; G],
     ) -> [[Self::Lanes; G]; Q] {
         let mut sums = [[[0; GROUP_ROWS]; G]; Q];
         for (query, sums) in queries.iter().zip(&mut sums) {
             for (group, sums) in groups.iter().zip(sums) {
-                for (quad, line) in query.iter().zip(group) {
+                for (quad, line) in query.iter().zip(group.lines) {
                     for (row, sum) in line.0.iter().zip(&mut *sums) {
                         for (&q, &v) in quad.iter().zip(row) {
                             *sum += q * i32::from(v);

@@ -51,6 +51,33 @@ fn every_tier_agrees_with_the_definition() {
     }
 }
 
+/// Bytes at the ends of their range as often as not, on both sides of what sums of 16 bits hold: with 64 taken off, 191 is the
+/// largest byte of a query that eight bits hold, and 127 * 4 * 64 the largest sum of four products that sixteen do.
+#[test]
+fn every_tier_agrees_where_short_sums_end() {
+    let mut rng = Rng::from_parts(&[8]);
+    for largest_of_queries in [60, 128, 129, 191, 192, 255] {
+        for largest_of_rows in [40, 64, 65, 127, 128, 255] {
+            let mut bytes_up_to = |largest: usize, n: usize| -> Vec<Descriptor> {
+                let mut byte = || [0, largest, rng.below(largest + 1), largest][rng.below(4)] as u8;
+                (0..n).map(|_| std::array::from_fn(|_| byte())).collect()
+            };
+            let mut queries = bytes_up_to(largest_of_queries, 9);
+            let mut rows = bytes_up_to(largest_of_rows, 40);
+            queries.push([largest_of_queries as u8; DESCRIPTOR_LEN]);
+            rows.push([largest_of_rows as u8; DESCRIPTOR_LEN]);
+            let packed = PackedDescriptors::pack(&rows);
+            let (expected, expected_of_rows) = (brute_force(&queries, &rows), brute_force(&rows, &queries));
+            for &tier in Tier::ALL.iter().filter(|tier| tier.is_available()) {
+                let (mut out, mut of_rows) = (Vec::new(), Vec::new());
+                tier.top2_both(&queries, &packed, &mut out, &mut of_rows);
+                assert_eq!(out, expected, "{tier:?} {largest_of_queries} {largest_of_rows}");
+                assert_eq!(of_rows, expected_of_rows, "{tier:?} {largest_of_queries} {largest_of_rows}");
+            }
+        }
+    }
+}
+
 #[test]
 fn the_least_distance_is_the_definition_s_in_every_tier() {
     let mut rng = Rng::from_parts(&[7]);
@@ -108,10 +135,10 @@ fn packing_is_the_same_with_and_without_vectors() {
     let rows = std::array::from_fn(|row| &descriptors[row]);
     let empty = || ([Line([[0; 4]; GROUP_ROWS]); QUADS], [0; GROUP_ROWS]);
     let ((mut plain, mut plain_biases), (mut lines, mut biases)) = (empty(), empty());
-    pack_group_plainly(&rows, &mut plain, &mut plain_biases);
+    let plain_short = pack_group_plainly(&rows, &mut plain, &mut plain_biases);
     // SAFETY: AVX2 is there.
-    unsafe { super::x86::pack_group(&rows, &mut lines, &mut biases) };
-    assert_eq!(biases, plain_biases);
+    let short = unsafe { super::x86::pack_group(&rows, &mut lines, &mut biases) };
+    assert_eq!((short, biases), (plain_short, plain_biases));
     assert!(lines.iter().zip(&plain).all(|(a, b)| a.0 == b.0));
 }
 
