@@ -12,6 +12,8 @@ mod degenerate;
 mod determinism;
 #[path = "cli/evaluate.rs"]
 mod evaluate;
+#[path = "cli/feature_street.rs"]
+mod feature_street;
 #[path = "cli/look_alikes.rs"]
 mod look_alikes;
 #[path = "cli/reconstruct.rs"]
