@@ -191,10 +191,11 @@ unsafe fn scan_block<K: Kernel, const Q: usize, const G: usize>(
                 at += 1;
             }
         }
-        for at in at..groups.end {
+        while at < groups.end {
             let dots = K::dots::<Q, 1>(prepared, &[packed.group(at)]);
             let column = std::array::from_fn(|q| dots[q][0]);
             update::<K, Q>(&column, norms_sq, first_query, &biases[at], at, &mut running, rows.as_deref_mut());
+            at += 1;
         }
         std::array::from_fn(|q| reduce::<K>(&running[q]))
     }

@@ -1,5 +1,8 @@
 //! Kernels for x86-64: AVX2, AVX-VNNI (256 bits) and AVX-512 VNNI.
 
+// A tile is indexed by query, group, quad and half at once, each of several arrays.
+#![allow(clippy::needless_range_loop)]
+
 use std::arch::x86_64::*;
 
 use super::kernel::Kernel;
