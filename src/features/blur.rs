@@ -123,30 +123,28 @@ fn blur_columns_body<const FMA: bool, const PIECE: usize>(
     around: &[&[f32]],
     outs: [&mut [f32]; BATCH],
 ) {
-    let [out_0, out_1, out_2, out_3] = outs;
-    for start in (0..out_0.len()).step_by(PIECE) {
+    let [out_0, out_1, out_2, out_3] = outs.map(|out| out.as_chunks_mut::<PIECE>().0);
+    let pieces = out_0.iter_mut().zip(out_1).zip(out_2).zip(out_3).enumerate();
+    for (at, (((out_0, out_1), out_2), out_3)) in pieces {
         // Four arrays by name, not an array of arrays: the compiler keeps only these in registers.
         let (mut sum_0, mut sum_1) = ([0.0_f32; PIECE], [0.0_f32; PIECE]);
         let (mut sum_2, mut sum_3) = ([0.0_f32; PIECE], [0.0_f32; PIECE]);
         for (row, weights) in around.iter().zip(weights.windows(BATCH)) {
-            let row = &row[start..start + PIECE];
-            for i in 0..PIECE {
-                sum_0[i] = mul_add::<FMA>(weights[3], row[i], sum_0[i]);
-            }
-            for i in 0..PIECE {
-                sum_1[i] = mul_add::<FMA>(weights[2], row[i], sum_1[i]);
-            }
-            for i in 0..PIECE {
-                sum_2[i] = mul_add::<FMA>(weights[1], row[i], sum_2[i]);
-            }
-            for i in 0..PIECE {
-                sum_3[i] = mul_add::<FMA>(weights[0], row[i], sum_3[i]);
-            }
+            let row = &row.as_chunks::<PIECE>().0[at];
+            add_weighted::<FMA, PIECE>(weights[3], row, &mut sum_0);
+            add_weighted::<FMA, PIECE>(weights[2], row, &mut sum_1);
+            add_weighted::<FMA, PIECE>(weights[1], row, &mut sum_2);
+            add_weighted::<FMA, PIECE>(weights[0], row, &mut sum_3);
         }
-        out_0[start..start + PIECE].copy_from_slice(&sum_0);
-        out_1[start..start + PIECE].copy_from_slice(&sum_1);
-        out_2[start..start + PIECE].copy_from_slice(&sum_2);
-        out_3[start..start + PIECE].copy_from_slice(&sum_3);
+        (*out_0, *out_1, *out_2, *out_3) = (sum_0, sum_1, sum_2, sum_3);
+    }
+}
+
+/// Adds the weighted values to the sums.
+#[inline(always)]
+fn add_weighted<const FMA: bool, const PIECE: usize>(weight: f32, values: &[f32; PIECE], sums: &mut [f32; PIECE]) {
+    for i in 0..PIECE {
+        sums[i] = mul_add::<FMA>(weight, values[i], sums[i]);
     }
 }
 
