@@ -95,9 +95,14 @@ export class Upload {
     return this.dataset;
   }
 
-  /** Everything has become a job: a later choice of the same files is a new one. */
+  /**
+   * Everything has become a job: a later choice of the same files is a new one. Of a photograph that came whole just as the page
+   * was loaded again, the note of its upload is still there.
+   */
   finish() {
     memory.drop(this.memory);
+    // As tus-js-client writes its notes.
+    if (this.dataset) memory.drop(`tus::${this.dataset.id}|`);
   }
 
   /** Stops and removes what was sent. */
@@ -107,8 +112,6 @@ export class Upload {
     for (const { abort } of this.current.values()) abort();
     this.finish();
     if (!this.dataset) return;
-    // As tus-js-client writes its notes.
-    memory.drop(`tus::${this.dataset.id}|`);
     await deleteDataset(this.dataset).catch(() => {});
   }
 
