@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
-use super::features::FeatureCache;
+use super::features::StoredFeatures;
 use super::runner::{Counts, StageProgress, counts};
 use super::units::Units;
 use super::{Context, PipelineError, Stage};
@@ -23,7 +23,7 @@ const UNIT_PAIRS: usize = 32;
 /// What the stage is given besides the models.
 pub struct PointAdder<'a> {
     /// Features of every image.
-    pub cache: &'a FeatureCache<'a>,
+    pub features: &'a StoredFeatures<'a>,
     /// Where finished units are kept.
     pub units: &'a Units<'a>,
     /// How.
@@ -65,7 +65,7 @@ impl PointAdder<'_> {
         };
         let cancelled = || self.context.cancel.is_cancelled();
         // The matcher keeps them while it needs them.
-        let features = |id: ImageId| -> Arc<Features> { Arc::new(self.cache.read(id, None)) };
+        let features = |id: ImageId| -> Arc<Features> { Arc::new(self.features.read(id, None)) };
         let mut matcher = PairMatcher::new(model, &features, self.options, self.context.seed);
         let mut matches: Vec<PairMatches> = Vec::with_capacity(pairs.len());
         let mut reused = 0;
@@ -91,7 +91,7 @@ impl PointAdder<'_> {
     /// The outcome of a step, or why there is none: features that do not fit the model are features that were lost.
     fn expect<T>(&self, outcome: Result<T, AddPointsError>) -> Result<T, PipelineError> {
         self.context.check_cancelled()?;
-        self.cache.check(Stage::AddPoints)?;
+        self.features.check(Stage::AddPoints)?;
         Ok(outcome.expect("neither cancelled nor with lost features"))
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::coarse_match::{CoarseMatches, Matcher};
-use super::features::{FeatureCache, ImageFeatures};
+use super::features::{ImageFeatures, StoredFeatures};
 use super::growing::GrowingModels;
 use super::intake::Intake;
 use super::options::ReconstructionOptions;
@@ -34,9 +34,6 @@ pub struct Coarse {
     /// Pairs that were cut as look-alikes.
     pub cut: Vec<CutPair>,
 }
-
-/// Memory for features read for their positions; they are read once here, so little is kept.
-const POSITION_CACHE_BYTES: usize = 64 << 20;
 
 /// Matches and reconstructs the largest scales; widens the selection while too few images are registered and keeps the best.
 ///
@@ -71,18 +68,18 @@ pub fn run(
             Some(&match_key),
             0,
             |store, progress| {
-                let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
+                let features = StoredFeatures::new(store, found);
                 let matcher = Matcher {
                     units: Units::new(store, Stage::CoarseMatch, &match_key),
                     intake,
                     found,
                     options: &options.coarse,
                     selection: &selection,
-                    cache: &cache,
+                    features: &features,
                     context,
                 };
                 let result = matcher.run(&before, &settled.unwrap_or_default(), progress)?;
-                cache.check(Stage::CoarseMatch)?;
+                features.check(Stage::CoarseMatch)?;
                 Ok(result)
             },
         )?;
@@ -90,9 +87,9 @@ pub fn run(
         let stage = StageKey { stage: Stage::CoarseModel, iteration };
         let (models, account): (CoarseModels, LookAlikeAccount) =
             runner.stage(stage, Some(&model_key), usable as u64, |store, progress| {
-                let cache = FeatureCache::new(store, found, POSITION_CACHE_BYTES);
-                let input = mapper_input(intake, &cache, &matches);
-                cache.check(Stage::CoarseModel)?;
+                let features = StoredFeatures::new(store, found);
+                let input = mapper_input(intake, &features, &matches);
+                features.check(Stage::CoarseModel)?;
                 let growing = GrowingModels::new(Units::new(store, Stage::CoarseModel, &model_key));
                 let run = MapperRun {
                     seed: context.seed,
@@ -222,10 +219,10 @@ fn registered(models: &CoarseModels) -> usize {
     models.models.iter().map(|model| model.images().len()).sum()
 }
 
-fn mapper_input(intake: &Intake, cache: &FeatureCache<'_>, matches: &CoarseMatches) -> MapperInput {
+fn mapper_input(intake: &Intake, features: &StoredFeatures<'_>, matches: &CoarseMatches) -> MapperInput {
     let images = intake.photographs().map(|(id, _, photograph)| {
         let camera = photograph.camera;
-        (id, MapperImage { camera, keypoints: positions(cache, id) })
+        (id, MapperImage { camera, keypoints: positions(features, id) })
     });
     MapperInput {
         images: images.collect(),
@@ -236,7 +233,7 @@ fn mapper_input(intake: &Intake, cache: &FeatureCache<'_>, matches: &CoarseMatch
 }
 
 /// The position of every keypoint of an image.
-fn positions(cache: &FeatureCache<'_>, id: ImageId) -> Arc<[Pixel]> {
-    let features = cache.read(id, None);
+fn positions(stored: &StoredFeatures<'_>, id: ImageId) -> Arc<[Pixel]> {
+    let features = stored.read(id, None);
     features.keypoints.iter().map(|keypoint| Pixel::new(f64::from(keypoint.x), f64::from(keypoint.y))).collect()
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::features::{FeatureCache, ImageFeatures};
+use super::features::{ImageFeatures, StoredFeatures};
 use super::intake::{Intake, Photograph};
 use super::options::CoarseOptions;
 use super::runner::{Counts, StageProgress, counts};
@@ -54,7 +54,7 @@ pub(super) struct Matcher<'a> {
     pub(super) found: &'a BTreeMap<ImageId, ImageFeatures>,
     pub(super) options: &'a CoarseOptions,
     pub(super) selection: &'a SelectionOptions,
-    pub(super) cache: &'a FeatureCache<'a>,
+    pub(super) features: &'a StoredFeatures<'a>,
     pub(super) context: &'a Context,
 }
 
@@ -158,7 +158,7 @@ impl Matcher<'_> {
             .par_iter()
             .map(|&(id, _, count)| {
                 let wanted = if all_pairs { 0 } else { options.preemptive_features };
-                self.cache.read(id, Some(wanted.min(self.selection.num_selected(count))))
+                self.features.read(id, Some(wanted.min(self.selection.num_selected(count))))
             })
             .collect();
         let position = |photograph: &Photograph| {
@@ -180,7 +180,7 @@ impl Matcher<'_> {
     /// Reads the features of largest scale of an image.
     fn select(&self, id: ImageId, camera: CameraId) -> Selected {
         let count = self.found.get(&id).and_then(|image| image.count.as_ref().ok()).copied().unwrap_or(0);
-        let features = self.cache.read(id, Some(self.selection.num_selected(count)));
+        let features = self.features.read(id, Some(self.selection.num_selected(count)));
         let pixels = features.keypoints.iter().map(|at| Pixel::new(f64::from(at.x), f64::from(at.y))).collect();
         Selected { pixels, descriptors: CoarseDescriptors::new(&features.descriptors), camera }
     }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -131,10 +131,49 @@ fn extract_one(
     Ok(Ok((features, look)))
 }
 
-/// Features read back when needed, the most recently used kept up to a budget of bytes.
-pub struct FeatureCache<'a> {
+/// Features of a run, read back from where they are stored.
+pub struct StoredFeatures<'a> {
     store: &'a ArtifactStore,
     keys: BTreeMap<ImageId, String>,
+    lost: Mutex<Vec<String>>,
+}
+
+impl<'a> StoredFeatures<'a> {
+    /// Of every image that has some.
+    pub fn new(store: &'a ArtifactStore, features: &BTreeMap<ImageId, ImageFeatures>) -> Self {
+        let usable = features.iter().filter(|(_, image)| image.count.is_ok());
+        Self { store, keys: usable.map(|(&id, image)| (id, image.key.clone())).collect(), lost: Mutex::default() }
+    }
+
+    /// The `limit` features of largest scale, or all; empty when they can't be read back ([`StoredFeatures::check`] then tells).
+    pub fn read(&self, id: ImageId, limit: Option<usize>) -> Features {
+        let Some(key) = self.keys.get(&id) else { return Features::default() };
+        let features =
+            self.store.get(key).ok().flatten().and_then(|bytes| feature_file::from_bytes(&bytes, limit).ok());
+        features.unwrap_or_else(|| {
+            self.lost.lock().unwrap_or_else(PoisonError::into_inner).push(key.clone());
+            Features::default()
+        })
+    }
+
+    /// Fails when features were lost since they were stored.
+    ///
+    /// # Errors
+    /// Names the first lost file.
+    pub fn check(&self, stage: Stage) -> Result<(), PipelineError> {
+        match self.lost.lock().unwrap_or_else(PoisonError::into_inner).first() {
+            None => Ok(()),
+            Some(key) => {
+                let gone = std::io::Error::new(std::io::ErrorKind::NotFound, "stored features are damaged or gone");
+                Err(io_error(stage, Path::new(key), gone))
+            }
+        }
+    }
+}
+
+/// Stored features, the most recently used kept in memory up to a budget of bytes.
+pub struct FeatureCache<'a> {
+    stored: StoredFeatures<'a>,
     budget_bytes: usize,
     state: Mutex<CacheState>,
 }
@@ -144,22 +183,15 @@ struct CacheState {
     clock: u64,
     bytes: usize,
     entries: BTreeMap<ImageId, (u64, Arc<Features>)>,
-    lost: Vec<String>,
 }
 
 /// Bytes one feature takes in memory.
 const FEATURE_BYTES: usize = 144;
 
 impl<'a> FeatureCache<'a> {
-    /// A cache over the stored features of a run.
-    pub fn new(store: &'a ArtifactStore, features: &BTreeMap<ImageId, ImageFeatures>, budget_bytes: usize) -> Self {
-        let usable = features.iter().filter(|(_, image)| image.count.is_ok());
-        Self {
-            store,
-            keys: usable.map(|(&id, image)| (id, image.key.clone())).collect(),
-            budget_bytes,
-            state: Mutex::default(),
-        }
+    /// With nothing in memory yet.
+    pub fn new(stored: StoredFeatures<'a>, budget_bytes: usize) -> Self {
+        Self { stored, budget_bytes, state: Mutex::default() }
     }
 
     /// The features of an image, empty when they can't be read back ([`FeatureCache::check`] then tells).
@@ -167,8 +199,8 @@ impl<'a> FeatureCache<'a> {
         if let Some(features) = self.recall(id) {
             return features;
         }
-        let features = Arc::new(self.read(id, None));
-        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let features = Arc::new(self.stored.read(id, None));
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.clock += 1;
         let now = state.clock;
         if state.entries.insert(id, (now, features.clone())).is_none() {
@@ -186,7 +218,7 @@ impl<'a> FeatureCache<'a> {
     }
 
     fn recall(&self, id: ImageId) -> Option<Arc<Features>> {
-        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.clock += 1;
         let now = state.clock;
         let entry = state.entries.get_mut(&id)?;
@@ -194,30 +226,11 @@ impl<'a> FeatureCache<'a> {
         Some(entry.1.clone())
     }
 
-    /// The `limit` features of largest scale, not kept.
-    pub fn read(&self, id: ImageId, limit: Option<usize>) -> Features {
-        let Some(key) = self.keys.get(&id) else { return Features::default() };
-        let features =
-            self.store.get(key).ok().flatten().and_then(|bytes| feature_file::from_bytes(&bytes, limit).ok());
-        features.unwrap_or_else(|| {
-            let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-            state.lost.push(key.clone());
-            Features::default()
-        })
-    }
-
-    /// Fails when features were lost since they were stored.
+    /// [`StoredFeatures::check`].
     ///
     /// # Errors
     /// Names the first lost file.
     pub fn check(&self, stage: Stage) -> Result<(), PipelineError> {
-        let state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        match state.lost.first() {
-            None => Ok(()),
-            Some(key) => {
-                let gone = std::io::Error::new(std::io::ErrorKind::NotFound, "stored features are damaged or gone");
-                Err(io_error(stage, Path::new(key), gone))
-            }
-        }
+        self.stored.check(stage)
     }
 }

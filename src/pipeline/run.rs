@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use super::add_points::PointAdder;
-use super::features::{self, FeatureCache, ImageFeatures};
+use super::features::{self, FeatureCache, ImageFeatures, StoredFeatures};
 use super::intake::{self, Intake};
 use super::localise::Localiser;
 use super::measure::Stopwatch;
@@ -29,8 +29,8 @@ pub struct RunPaths {
     pub work_dir: PathBuf,
 }
 
-/// Bytes of features kept in memory at most; more are read back from disk when needed. Measured on 128 images of 17,000 features:
-/// 64 MiB take no more CPU time than 768, and 194 MB less at the peak.
+/// Bytes of features kept in memory at most while cameras are added; more are read back from disk when needed. Measured on 128 images
+/// of 17,000 features: 64 MiB take no more CPU time than 768, and 194 MB less at the peak.
 pub(super) const FEATURE_CACHE_BYTES: usize = 64 << 20;
 
 /// Runs the pipeline on its own pool of `context.threads` threads and writes every output. That no model was found is not an
@@ -94,7 +94,7 @@ impl Pipeline<'_> {
             let waiting = (found.len() - state.located().len()) as u64;
             let before = state;
             state = runner.stage(stage, Some(&models_key), waiting, |store, progress| {
-                let cache = FeatureCache::new(store, &found, FEATURE_CACHE_BYTES);
+                let cache = FeatureCache::new(StoredFeatures::new(store, &found), FEATURE_CACHE_BYTES);
                 let units = Units::new(store, Stage::AddCameras, &models_key);
                 let localiser = Localiser {
                     intake: &intake,
@@ -118,9 +118,9 @@ impl Pipeline<'_> {
             models_key = ArtifactKey::of("add_points", &[&models_key.0, &iteration, &options.add_points]);
             let before = state;
             state = runner.stage(stage, Some(&models_key), 0, |store, progress| {
-                let cache = FeatureCache::new(store, &found, FEATURE_CACHE_BYTES);
+                let features = StoredFeatures::new(store, &found);
                 let units = Units::new(store, Stage::AddPoints, &models_key);
-                let adder = PointAdder { cache: &cache, units: &units, options: &options.add_points, context };
+                let adder = PointAdder { features: &features, units: &units, options: &options.add_points, context };
                 let mut state = before;
                 let mut totals = Counts::new();
                 for (rank, ModelState { model, .. }) in state.models.iter_mut().enumerate() {

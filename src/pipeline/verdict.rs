@@ -78,16 +78,7 @@ pub fn verdicts(
 
 fn registered(report: &mut ImageReport, id: ImageId, model: usize, state: &PipelineState) {
     let account = &state.models[model];
-    let image = &account.model.images()[&id];
-    let errors: Vec<f64> = (0u32..)
-        .map(crate::scene::KeypointIdx)
-        .zip(image.points())
-        .filter_map(|(keypoint, point)| {
-            point.map(|point| {
-                account.model.reprojection_error_px(point, crate::scene::Observation { image: id, keypoint })
-            })
-        })
-        .collect();
+    let errors: Vec<f64> = account.model.errors_of_image_px(id).map(|(_, error_px)| error_px).collect();
     report.state = ImageState::Registered;
     report.model = Some(model);
     report.registered_in = account.registered_in.get(&id).cloned();

@@ -266,20 +266,32 @@ impl Reconstruction {
     /// # Panics
     /// When the point or the image is unknown.
     pub fn reprojection_error_px(&self, id: Point3dId, observation: Observation) -> f64 {
-        let point = self.points[id.index()].as_ref().expect("the point of a sighting exists");
         let image = &self.images[&observation.image];
-        let x_in_cam = image.cam_from_world.apply(&point.xyz);
-        match self.cameras[&image.camera].project(&x_in_cam) {
-            Some(pixel) => (pixel.0 - image.keypoints[observation.keypoint.index()].0).norm(),
-            None => f64::INFINITY,
-        }
+        self.error_px(image, &self.cameras[&image.camera], id, &image.keypoints[observation.keypoint.index()])
     }
 
-    /// The reprojection error of every sighting of every point, in id and track order.
+    /// The point and the [`Reconstruction::reprojection_error_px`] of every sighting of an image, in order of its keypoints.
+    ///
+    /// # Panics
+    /// When the image is unknown.
+    pub fn errors_of_image_px(&self, id: ImageId) -> impl Iterator<Item = (Point3dId, f64)> {
+        let image = &self.images[&id];
+        let camera = &self.cameras[&image.camera];
+        let seen = image.points.iter().zip(image.keypoints.iter());
+        seen.filter_map(move |(point, keypoint)| Some(((*point)?, self.error_px(image, camera, (*point)?, keypoint))))
+    }
+
+    /// The reprojection error of every sighting of every point, image by image.
     pub fn reprojection_errors_px(&self) -> Vec<f64> {
-        self.points()
-            .flat_map(|(id, point)| point.track.iter().map(move |&seen| self.reprojection_error_px(id, seen)))
-            .collect()
+        self.images.keys().flat_map(|&id| self.errors_of_image_px(id)).map(|(_, error_px)| error_px).collect()
+    }
+
+    fn error_px(&self, image: &RegisteredImage, camera: &Camera, id: Point3dId, keypoint: &Pixel) -> f64 {
+        let point = self.points[id.index()].as_ref().expect("the point of a sighting exists");
+        match camera.project(&image.cam_from_world.apply(&point.xyz)) {
+            Some(pixel) => (pixel.0 - keypoint.0).norm(),
+            None => f64::INFINITY,
+        }
     }
 
     /// Number of sightings.

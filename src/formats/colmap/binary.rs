@@ -7,7 +7,9 @@ use std::io::{self, Read, Write};
 
 use nalgebra::Vector3;
 
-use super::{ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, mean_error_px, used_cameras};
+use super::{
+    ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, points_with_mean_errors, used_cameras,
+};
 use crate::camera::{Camera, CameraModel, MAX_PARAMS, Pixel};
 use crate::formats::FormatError;
 use crate::scene::{ImageId, Reconstruction};
@@ -73,11 +75,11 @@ pub fn write_images_bin<'a>(
 /// When writing fails.
 pub fn write_points3d_bin(model: &Reconstruction, out: &mut impl Write) -> io::Result<()> {
     out.write_all(&(model.num_points() as u64).to_le_bytes())?;
-    for (id, point) in model.points() {
+    for (id, point, error_px) in points_with_mean_errors(model) {
         out.write_all(&(id.index() as u64 + 1).to_le_bytes())?;
         write_f64s(out, point.xyz.as_slice())?;
         out.write_all(&point.color)?;
-        write_f64s(out, &[mean_error_px(model, id, point)])?;
+        write_f64s(out, &[error_px])?;
         out.write_all(&(point.track.len() as u64).to_le_bytes())?;
         for seen in &point.track {
             out.write_all(&(seen.image.0 + 1).to_le_bytes())?;

@@ -32,10 +32,15 @@ fn used_cameras(model: &Reconstruction) -> BTreeMap<CameraId, &Camera> {
     model.cameras.iter().filter(|(id, _)| used.contains(id)).map(|(&id, camera)| (id, camera)).collect()
 }
 
-/// The mean reprojection error of a point's sightings.
-fn mean_error_px(model: &Reconstruction, id: Point3dId, point: &Point3d) -> f64 {
-    let sum: f64 = point.track.iter().map(|&seen| model.reprojection_error_px(id, seen)).sum();
-    sum / point.track.len() as f64
+/// Every point in order of ids, with the mean reprojection error of its sightings in pixels.
+fn points_with_mean_errors(model: &Reconstruction) -> impl Iterator<Item = (Point3dId, &Point3d, f64)> {
+    let mut sums_px = vec![0.0; model.point_id_bound()];
+    for &image in model.images().keys() {
+        for (id, error_px) in model.errors_of_image_px(image) {
+            sums_px[id.index()] += error_px;
+        }
+    }
+    model.points().map(move |(id, point)| (id, point, sums_px[id.index()] / point.track.len() as f64))
 }
 
 /// A camera of a file's fields.

@@ -8,7 +8,9 @@ use std::str::{FromStr, SplitWhitespace};
 
 use nalgebra::Vector3;
 
-use super::{ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, mean_error_px, used_cameras};
+use super::{
+    ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, points_with_mean_errors, used_cameras,
+};
 use crate::camera::{Camera, CameraModel, Pixel};
 use crate::formats::FormatError;
 use crate::scene::{ImageId, Reconstruction};
@@ -68,10 +70,10 @@ pub fn write_images_txt<'a>(
 /// When writing fails.
 pub fn write_points3d_txt(model: &Reconstruction, out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "# One point a line: POINT3D_ID X Y Z R G B ERROR (IMAGE_ID POINT2D_IDX)[]")?;
-    for (id, point) in model.points() {
+    for (id, point, error_px) in points_with_mean_errors(model) {
         let (xyz, [r, g, b]) = (point.xyz, point.color);
         write!(out, "{} {} {} {} {r} {g} {b}", id.index() as u64 + 1, xyz.x, xyz.y, xyz.z)?;
-        write!(out, " {}", mean_error_px(model, id, point))?;
+        write!(out, " {error_px}")?;
         for seen in &point.track {
             write!(out, " {} {}", seen.image.0 + 1, seen.keypoint.0)?;
         }

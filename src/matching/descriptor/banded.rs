@@ -151,17 +151,18 @@ pub(super) unsafe fn scan<K: Kernel, const Q: usize>(
                 }
                 scanned_to = scanned_to.max(joined.end);
             }
-            out.extend((0..used).map(|q| {
+            // Not in a closure: see `reduce`.
+            for q in 0..used {
                 let nearest = reduce::<K>(&running[q]);
                 let mut counts = [0; GROUP_ROWS];
                 K::store(candidates[q], &mut counts);
-                BandTop2 {
+                out.push(BandTop2 {
                     nearest: (nearest.distance_sq < PADDING_LIMIT as u32)
                         .then_some((nearest.index, nearest.distance_sq)),
                     second_distance_sq: nearest.second_distance_sq,
                     candidates: counts.iter().sum::<i32>() as u32,
-                }
-            }));
+                });
+            }
         }
     }
 }
@@ -201,12 +202,12 @@ pub(super) unsafe fn scan_off<K: Kernel, const Q: usize>(
                     nearest[q] = K::min(nearest[q], distance);
                 }
             }
-            out.extend(nearest[..used].iter().map(|&lanes| {
+            for &lanes in &nearest[..used] {
                 let mut distances = [0; GROUP_ROWS];
                 K::store(lanes, &mut distances);
                 let least = distances.into_iter().fold(i32::MAX, i32::min);
-                (least < PADDING_LIMIT).then_some(least as u32)
-            }));
+                out.push((least < PADDING_LIMIT).then_some(least as u32));
+            }
         }
     }
 }

@@ -197,7 +197,11 @@ unsafe fn scan_block<K: Kernel, const Q: usize, const G: usize>(
             update::<K, Q>(&column, norms_sq, first_query, &biases[at], at, &mut running, rows.as_deref_mut());
             at += 1;
         }
-        std::array::from_fn(|q| reduce::<K>(&running[q]))
+        let mut found = [reduce::<K>(&running[0]); Q];
+        for (found, running) in found.iter_mut().zip(&running).skip(1) {
+            *found = reduce::<K>(running);
+        }
+        found
     }
 }
 
@@ -237,7 +241,8 @@ unsafe fn update<K: Kernel, const Q: usize>(
     }
 }
 
-/// The best and second best over the sixteen lanes.
+/// The best and second best over the sixteen lanes. Neither this nor its callers use closures around the methods of `K`: a closure
+/// is compiled without the instructions of the function around it, and every one of `K` in it becomes a call through memory.
 #[inline(always)]
 pub(super) unsafe fn reduce<K: Kernel>(running: &Running<K::Lanes>) -> Top2 {
     let (mut best, mut second, mut group) = ([0; GROUP_ROWS], [0; GROUP_ROWS], [0; GROUP_ROWS]);
@@ -248,10 +253,11 @@ pub(super) unsafe fn reduce<K: Kernel>(running: &Running<K::Lanes>) -> Top2 {
         K::store(running.group, &mut group);
     }
     let nearest = best.iter().copied().fold(i32::MAX, i32::min);
-    let rows: [i32; GROUP_ROWS] = std::array::from_fn(|lane| {
-        if best[lane] == nearest { group[lane] * GROUP_ROWS as i32 + lane as i32 } else { i32::MAX }
-    });
-    let index = rows.into_iter().fold(i32::MAX, i32::min);
+    let mut index = i32::MAX;
+    for (lane, (&best, &group)) in best.iter().zip(&group).enumerate() {
+        let row = group * GROUP_ROWS as i32 + lane as i32;
+        index = index.min(if best == nearest { row } else { i32::MAX });
+    }
     let winner = index as usize % GROUP_ROWS;
     // In the winner's lane its own second takes the place of the best.
     best[winner] = second[winner];

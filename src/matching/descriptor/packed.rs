@@ -19,6 +19,7 @@ pub(super) struct Line(pub(super) [[u8; 4]; GROUP_ROWS]);
 
 /// What the kernel of AVX2 must know of a group to multiply bytes with sums of 16 bits (see `x86::Avx2`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code, reason = "read by the kernel of AVX2 alone"))]
 pub(super) struct ShortSums {
     /// For every row `(128 - SHORT_OFFSET)` times the sum of its bytes.
     pub(super) shifts: [i32; GROUP_ROWS],
@@ -30,19 +31,11 @@ pub(super) struct ShortSums {
 pub(super) const SHORT_OFFSET: u8 = 64;
 
 impl ShortSums {
-    /// Of the rows of a group, of which `most` is known.
+    /// Of the rows of a group with these sums of bytes, of which `most` is known.
     #[inline(always)]
-    pub(super) fn new(rows: &[&Descriptor; GROUP_ROWS], most: i32) -> Self {
+    pub(super) fn new(row_sums: &[i32; GROUP_ROWS], most: i32) -> Self {
         let weight = i32::from(QUERY_OFFSET) - i32::from(SHORT_OFFSET);
-        Self { shifts: rows.map(|row| weight * sum(row)), most }
-    }
-
-    /// Of the rows of a group.
-    fn of(rows: &[&Descriptor; GROUP_ROWS]) -> Self {
-        let eights = rows.iter().flat_map(|row| row.as_chunks::<8>().0);
-        let sums =
-            eights.flat_map(|eight| [0, 2].map(|at| [at, at + 1, at + 4, at + 5].map(|at| i32::from(eight[at]))));
-        Self::new(rows, sums.map(|four| four.iter().sum()).max().unwrap_or(0))
+        Self { shifts: row_sums.map(|sum| weight * sum), most }
     }
 }
 
@@ -52,6 +45,7 @@ pub(super) struct Group<'a> {
     /// Its quads.
     pub(super) lines: &'a [Line; QUADS],
     /// Used where bytes are multiplied with sums of 16 bits.
+    #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code, reason = "read by the kernel of AVX2 alone"))]
     pub(super) short: &'a ShortSums,
 }
 
@@ -183,8 +177,11 @@ pub(super) fn pack_group_plainly(
         let at = 4 * quad;
         *line = Line(rows.map(|row| [row[at], row[at + 1], row[at + 2], row[at + 3]]));
     }
-    *biases = rows.map(bias);
-    ShortSums::of(rows)
+    let row_sums = rows.map(sum);
+    biases_of(rows, &row_sums, biases);
+    let eights = rows.iter().flat_map(|row| row.as_chunks::<8>().0);
+    let fours = eights.flat_map(|eight| [0, 2].map(|at| [at, at + 1, at + 4, at + 5].map(|at| i32::from(eight[at]))));
+    ShortSums::new(&row_sums, fours.map(|four| four.iter().sum()).max().unwrap_or(0))
 }
 
 /// Squared length of a descriptor. At most 128 * 255^2, so wrapping never happens; saying so keeps the loop free of checks.
@@ -195,13 +192,20 @@ pub(super) fn norm_sq(descriptor: &Descriptor) -> i32 {
         .fold(0, |sum, &byte| i32::wrapping_add(sum, i32::from(u16::wrapping_mul(byte.into(), byte.into()))))
 }
 
-/// The bias of the module's formula.
+/// The biases of the module's formula, of rows with these sums of bytes.
 #[inline(always)]
-pub(super) fn bias(row: &Descriptor) -> i32 {
-    norm_sq(row) - 2 * i32::from(QUERY_OFFSET) * sum(row)
+pub(super) fn biases_of(
+    rows: &[&Descriptor; GROUP_ROWS],
+    row_sums: &[i32; GROUP_ROWS],
+    biases: &mut [i32; GROUP_ROWS],
+) {
+    for ((bias, row), row_sum) in biases.iter_mut().zip(rows).zip(row_sums) {
+        *bias = norm_sq(row) - 2 * i32::from(QUERY_OFFSET) * row_sum;
+    }
 }
 
+/// The sum of a descriptor's bytes.
 #[inline(always)]
-fn sum(row: &Descriptor) -> i32 {
+pub(super) fn sum(row: &Descriptor) -> i32 {
     row.iter().fold(0, |sum, &byte| i32::wrapping_add(sum, byte.into()))
 }

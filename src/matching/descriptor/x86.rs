@@ -6,7 +6,7 @@
 use std::arch::x86_64::*;
 
 use super::kernel::Kernel;
-use super::packed::{GROUP_ROWS, Group, Line, QUADS, QUERY_OFFSET, ShortSums, bias};
+use super::packed::{GROUP_ROWS, Group, Line, QUADS, QUERY_OFFSET, ShortSums, biases_of, sum};
 use crate::scene::Descriptor;
 
 /// Lines and biases of sixteen rows: the 16 x 32 quads of the rows are transposed in blocks of 8 x 8, three rounds of
@@ -45,8 +45,13 @@ pub(super) fn pack_group(
             }
         }
     }
-    *biases = rows.map(bias);
-    ShortSums::new(rows, most_of_four(rows))
+    // Loops: a closure would be compiled for other instructions.
+    let mut row_sums = [0; GROUP_ROWS];
+    for (row_sum, row) in row_sums.iter_mut().zip(rows) {
+        *row_sum = sum(row);
+    }
+    biases_of(rows, &row_sums, biases);
+    ShortSums::new(&row_sums, most_of_four(rows))
 }
 
 /// [`ShortSums::most`] of these rows: of every eight bytes, the sums of two and two.

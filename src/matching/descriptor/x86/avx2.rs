@@ -80,7 +80,7 @@ unsafe fn short_dots<const Q: usize, const G: usize>(
         let mut sums = [[[_mm256_setzero_si256(); 2]; G]; Q];
         for pair in 0..QUADS / 2 {
             for g in 0..G {
-                let lines: *const __m256i = (&raw const groups[g].lines[2 * pair]).cast();
+                let lines: *const __m256i = groups[g].lines.as_ptr().add(2 * pair).cast();
                 for h in 0..2 {
                     let (a, b) = (_mm256_load_si256(lines.add(h)), _mm256_load_si256(lines.add(2 + h)));
                     for q in 0..Q {
