@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::bundle::FreeIntrinsics;
+use crate::bundle::{FocalPrior, FreeIntrinsics};
 use crate::camera::{Camera, CameraModel, FocalSource};
 use crate::scene::{CameraId, ImageId, Reconstruction};
 
@@ -32,6 +32,13 @@ pub struct IntrinsicsOptions {
     pub min_images_for_opencv: Option<usize>,
     /// Whether intrinsics are refined at all (known ones never are).
     pub refine: bool,
+    /// The focal length that photographs without EXIF are expected to have, as a share of the longer side: 1.2 sees 45 degrees.
+    pub typical_focal: f64,
+    /// Standard deviation of its logarithm; null leaves such focal lengths without a prior. It covers wide lenses and short
+    /// telephotos, and weighs no more than one sighting, so it decides only where the sightings leave a focal length open: of
+    /// nine runs on a street of 29 photographs without EXIF, four ended at 20 to 12,000 times the longer side without it, and none
+    /// of eight beyond 7 with it.
+    pub typical_focal_sigma_log: Option<f64>,
     /// Share up to which the focal lengths of two cameras of one image size, neither from EXIF, agree: they are one camera.
     pub agreeing_focal_difference: f64,
 }
@@ -75,6 +82,8 @@ impl Default for IntrinsicsOptions {
             min_images_for_radial: 4,
             min_images_for_opencv: None,
             refine: true,
+            typical_focal: 1.2,
+            typical_focal_sigma_log: Some(0.5),
             agreeing_focal_difference: 0.04,
         }
     }
@@ -95,6 +104,17 @@ pub fn free_intrinsics(model: &Reconstruction, options: &IntrinsicsOptions) -> B
         }
     };
     sharing(model).into_iter().map(|(id, sharing)| (id, free(id, sharing))).collect()
+}
+
+/// What the focal lengths that nothing but the photographs told are expected to be.
+pub fn focal_priors(model: &Reconstruction, options: &IntrinsicsOptions) -> BTreeMap<CameraId, FocalPrior> {
+    let Some(sigma_log) = options.typical_focal_sigma_log else { return BTreeMap::new() };
+    let told = model.cameras.iter().filter(|(_, camera)| is_told_by_photographs(camera));
+    let prior = |camera: &Camera| {
+        let focal_px = options.typical_focal * f64::from(camera.width.max(camera.height));
+        FocalPrior { focal_px, sigma_log }
+    };
+    told.map(|(&id, camera)| (id, prior(camera))).collect()
 }
 
 /// Whether nothing but the photographs told a camera's focal length, so that images may be moved to it and away from it.

@@ -13,7 +13,8 @@ mod tracks;
 
 pub use filter::{KeepLimits, filter};
 pub use intrinsics::{
-    IntrinsicsOptions, PrincipalPoint, add_camera, cameras_to_share, free_intrinsics, merge_agreeing_cameras,
+    IntrinsicsOptions, PrincipalPoint, add_camera, cameras_to_share, focal_priors, free_intrinsics,
+    merge_agreeing_cameras,
 };
 pub use mapper::{
     Checkpoint, Checkpoints, CoarseModels, MapperImage, MapperInput, MapperOptions, MapperRun, Unregistered,

@@ -4,7 +4,7 @@ use super::options::ReconstructionOptions;
 use super::{Context, PipelineError};
 use crate::add_points::remove_strays;
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
-use crate::coarse::{KeepLimits, filter, free_intrinsics, merge_agreeing_cameras};
+use crate::coarse::{KeepLimits, filter, focal_priors, free_intrinsics, merge_agreeing_cameras};
 use crate::scene::{Point3dId, Reconstruction};
 
 /// Refines a model in place.
@@ -21,6 +21,7 @@ pub fn refine(
         merge_agreeing_cameras(model, &options.coarse.mapper.intrinsics);
         let mut config = BundleConfig::global(model, FreeIntrinsics::default());
         config.intrinsics = free_intrinsics(model, &options.coarse.mapper.intrinsics);
+        config.focal_priors = focal_priors(model, &options.coarse.mapper.intrinsics);
         bundle::adjust_while(model, &config, &options.refine.bundle, &|| !context.cancel.is_cancelled());
         context.check_cancelled()?;
         let all: Vec<Point3dId> = model.points().map(|(id, _)| id).collect();

@@ -8,9 +8,10 @@ use super::measure::{Stopwatch, peak_rss_bytes};
 use super::options::ReconstructionOptions;
 use super::state::{ModelState, PipelineState, mean_and_median};
 use super::{Context, verdict};
-use crate::camera::FocalSource;
+use crate::camera::{Camera, FocalSource};
 use crate::coarse::look_alikes::CutPair;
 use crate::formats::report::{InputSummary, LookAlikePair, ModelReport, Report, Software, StageReport};
+use crate::geometry::focal_voting::FocalVotingOptions;
 use crate::scene::{CameraId, ImageId};
 
 /// The report of a finished run.
@@ -47,11 +48,7 @@ pub fn build(
 /// Tells of principal points found so far from the middle that programs which hold them there disagree with the model. `models`
 /// are in their final order.
 pub fn principal_point_notes(models: &[ModelState]) -> Vec<String> {
-    let cameras = models.iter().enumerate().flat_map(|(at, account)| {
-        let used: BTreeSet<CameraId> = account.model.images().values().map(|image| image.camera).collect();
-        used.into_iter().map(move |id| (at, &account.model.cameras[&id]))
-    });
-    let notes = cameras.filter(|(_, camera)| camera.focal_source != FocalSource::Known).filter_map(|(at, camera)| {
+    let notes = refined_cameras(models).filter_map(|(at, camera)| {
         let center = camera.principal_point().0;
         let (dx, dy) = (center.x - 0.5 * f64::from(camera.width), center.y - 0.5 * f64::from(camera.height));
         let turn_deg = (dx.hypot(dy) / camera.mean_focal_px()).atan().to_degrees();
@@ -65,6 +62,32 @@ pub fn principal_point_notes(models: &[ModelState]) -> Vec<String> {
         })
     });
     notes.collect()
+}
+
+/// Tells of focal lengths, not from EXIF, that hardly any lens has: the photographs left them open, and the shape of the model with them.
+pub fn focal_notes(models: &[ModelState], plausible: &FocalVotingOptions) -> Vec<String> {
+    let told = |camera: &Camera| matches!(camera.focal_source, FocalSource::Guess | FocalSource::Estimated);
+    let notes = refined_cameras(models).filter(|(_, camera)| told(camera)).filter_map(|(at, camera)| {
+        let ratio = camera.mean_focal_px() / f64::from(camera.width.max(camera.height));
+        (!(plausible.min_focal_ratio..=plausible.max_focal_ratio).contains(&ratio)).then(|| {
+            format!(
+                "Model {at}: the focal length of a {} x {} camera was found at {ratio:.2} times the longer side of the picture, \
+                 which hardly any lens has. These photographs do not tell it, and the model may be bent: photographs with EXIF, \
+                 or from more directions would, or the option intake.camera.",
+                camera.width, camera.height
+            )
+        })
+    });
+    notes.collect()
+}
+
+/// The cameras that images use and that are not known beforehand, with the number of their model.
+fn refined_cameras(models: &[ModelState]) -> impl Iterator<Item = (usize, &Camera)> {
+    let cameras = models.iter().enumerate().flat_map(|(at, account)| {
+        let used: BTreeSet<CameraId> = account.model.images().values().map(|image| image.camera).collect();
+        used.into_iter().map(move |id| (at, &account.model.cameras[&id]))
+    });
+    cameras.filter(|(_, camera)| camera.focal_source != FocalSource::Known)
 }
 
 /// A principal point that far from the middle, seen as an angle, is worth a note.
@@ -96,5 +119,28 @@ fn model_report(id: usize, ModelState { model, history, .. }: &ModelState) -> Mo
         mean_reprojection_error_px: mean,
         median_reprojection_error_px: median,
         stages: history.clone(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::CameraModel;
+    use crate::geometry::Rigid3;
+    use crate::scene::Reconstruction;
+
+    #[test]
+    fn a_focal_length_that_no_lens_has_is_told() {
+        let sources = [FocalSource::Guess, FocalSource::Estimated, FocalSource::Exif, FocalSource::Known];
+        for (source, noted) in sources.into_iter().zip([true, true, false, false]) {
+            for (focal_px, far) in [(900.0, false), (90.0, true), (5000.0, true)] {
+                let camera = Camera::centered(CameraModel::SimpleRadial, 1000, 800, focal_px, source);
+                let mut model = Reconstruction::new([(CameraId(0), camera.clone()), (CameraId(1), camera)].into());
+                model.register(ImageId(0), CameraId(0), Rigid3::identity(), [].into());
+                let states = [ModelState { model, registered_in: BTreeMap::new(), history: Vec::new() }];
+                let notes = focal_notes(&states, &FocalVotingOptions::default());
+                assert_eq!(notes.len(), usize::from(noted && far), "{source:?} {focal_px}: {notes:?}");
+            }
+        }
     }
 }

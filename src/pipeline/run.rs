@@ -207,6 +207,7 @@ impl Pipeline<'_> {
             })?;
             (exported.unwrap_or_default(), thumbnails)
         };
+        notes.extend(report::focal_notes(&state.models, &self.options.coarse.focals.voting));
         notes.extend(report::principal_point_notes(&state.models));
         let report =
             report::build(self.options, self.context, intake, found, &state, runner.stages, notes, cut, &watch);

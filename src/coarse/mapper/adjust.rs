@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{Mapper, Unregistered};
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
 use crate::coarse::filter::filter;
-use crate::coarse::intrinsics::{enrich_cameras, free_intrinsics, merge_agreeing_cameras};
+use crate::coarse::intrinsics::{enrich_cameras, focal_priors, free_intrinsics, merge_agreeing_cameras};
 use crate::scene::{CameraId, ImageId, Point3dId};
 
 impl Mapper<'_> {
@@ -38,6 +38,7 @@ impl Mapper<'_> {
             let split = self.split_cameras();
             let mut config = BundleConfig::global(&self.model, FreeIntrinsics::default());
             config.intrinsics = self.free_intrinsics();
+            config.focal_priors = focal_priors(&self.model, &self.options.intrinsics);
             bundle::adjust_while(&mut self.model, &config, &self.options.global_bundle, self.run.keep_going);
             let merged = merge_agreeing_cameras(&mut self.model, &self.options.intrinsics);
             let removed = self.filter(None);

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::Mapper;
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
 use crate::camera::{Camera, Pixel};
-use crate::coarse::intrinsics::{add_camera, is_told_by_photographs};
+use crate::coarse::intrinsics::{add_camera, focal_priors, is_told_by_photographs};
 use crate::geometry::Rigid3;
 use crate::math::Rng;
 use crate::ransac::absolute_pose;
@@ -83,6 +83,7 @@ impl Mapper<'_> {
             let free = FreeIntrinsics { focal: true, ..FreeIntrinsics::default() };
             config.intrinsics.insert(freed.images()[id].camera, free);
         }
+        config.focal_priors = focal_priors(&freed, &self.options.intrinsics);
         bundle::adjust_while(&mut freed, &config, &self.options.global_bundle, self.run.keep_going);
         let options = &self.options.pose.sharing;
         let stays = |id: &ImageId| {

@@ -117,6 +117,10 @@ impl MapperOptions {
         check(self.min_pose_inliers_relaxed >= 6, "min_pose_inliers_relaxed must be at least 6");
         check(self.max_starts >= 1, "max_starts must be at least 1");
         check((0.0..=1.0).contains(&self.satisfied_share), "satisfied_share must be in [0, 1]");
+        let positive = |value: f64| value.is_finite() && value > 0.0;
+        check(positive(self.intrinsics.typical_focal), "intrinsics.typical_focal must be positive");
+        let sigma_log = self.intrinsics.typical_focal_sigma_log;
+        check(sigma_log.is_none_or(positive), "intrinsics.typical_focal_sigma_log must be positive or null");
     }
 
     /// What sightings and points must keep.

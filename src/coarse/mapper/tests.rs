@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::*;
 use crate::camera::{CameraModel, FocalSource};
+use crate::coarse::{IntrinsicsOptions, focal_priors};
 use crate::matching::two_view::{self, TwoViewOptions};
 use crate::math::Rng;
 use crate::synthetic::{Layout, SceneOptions, SyntheticScene, generate};
@@ -92,6 +93,19 @@ fn images_of_one_zoom_share_one_camera() {
         let used: BTreeSet<CameraId> = model.images().values().map(|image| image.camera).collect();
         assert_eq!(used.len(), 1, "{layout:?}: {:?}", focals_px(model));
     }
+}
+
+#[test]
+fn only_focal_lengths_that_nothing_tells_have_a_prior() {
+    let camera = |source| Camera::centered(CameraModel::SimpleRadial, 1000, 800, 700.0, source);
+    let sources = [FocalSource::Guess, FocalSource::Exif, FocalSource::Estimated, FocalSource::Known];
+    let cameras = (0..).map(CameraId).zip(sources.map(camera)).collect();
+    let options = IntrinsicsOptions::default();
+    let priors = focal_priors(&Reconstruction::new(cameras), &options);
+    assert_eq!(priors.keys().collect::<Vec<_>>(), [&CameraId(0), &CameraId(2)]);
+    assert!(priors.values().all(|prior| prior.focal_px == 1200.0));
+    let none = IntrinsicsOptions { typical_focal_sigma_log: None, ..options };
+    assert_eq!(focal_priors(&Reconstruction::new([(CameraId(0), camera(FocalSource::Guess))].into()), &none).len(), 0);
 }
 
 /// An image whose pose is found every time and that every adjustment takes out again: it is given up and the rest stands.
