@@ -60,6 +60,13 @@ pub enum FocalSource {
     Known,
 }
 
+impl FocalSource {
+    /// Whether nothing but the photographs told the focal length, so that images may be moved to its camera and away from it.
+    pub fn is_told_by_photographs(self) -> bool {
+        matches!(self, Self::Guess | Self::Estimated)
+    }
+}
+
 /// One set of intrinsics.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {

@@ -109,7 +109,7 @@ pub fn free_intrinsics(model: &Reconstruction, options: &IntrinsicsOptions) -> B
 /// What the focal lengths that nothing but the photographs told are expected to be.
 pub fn focal_priors(model: &Reconstruction, options: &IntrinsicsOptions) -> BTreeMap<CameraId, FocalPrior> {
     let Some(sigma_log) = options.typical_focal_sigma_log else { return BTreeMap::new() };
-    let told = model.cameras.iter().filter(|(_, camera)| is_told_by_photographs(camera));
+    let told = model.cameras.iter().filter(|(_, camera)| camera.focal_source.is_told_by_photographs());
     let prior = |camera: &Camera| {
         let focal_px = options.typical_focal * f64::from(camera.width.max(camera.height));
         FocalPrior { focal_px, sigma_log }
@@ -117,19 +117,14 @@ pub fn focal_priors(model: &Reconstruction, options: &IntrinsicsOptions) -> BTre
     told.map(|(&id, camera)| (id, prior(camera))).collect()
 }
 
-/// Whether nothing but the photographs told a camera's focal length, so that images may be moved to it and away from it.
-pub(super) fn is_told_by_photographs(camera: &Camera) -> bool {
-    matches!(camera.focal_source, FocalSource::Guess | FocalSource::Estimated)
-}
-
 /// The cameras that an image of the group `group` may share, in id order: the group's own, and, where no EXIF told it, all of
 /// its size that images were split off to. Only cameras in use.
 pub fn cameras_to_share(model: &Reconstruction, group: CameraId, given: &Camera) -> Vec<CameraId> {
-    let told = is_told_by_photographs(given);
+    let told = given.focal_source.is_told_by_photographs();
     let fits = |id: &CameraId| {
         let camera = &model.cameras[id];
         let same_size = (camera.width, camera.height) == (given.width, given.height);
-        *id == group || (told && same_size && is_told_by_photographs(camera))
+        *id == group || (told && same_size && camera.focal_source.is_told_by_photographs())
     };
     sharing(model).into_keys().filter(fits).collect()
 }
@@ -153,8 +148,8 @@ pub fn merge_agreeing_cameras(model: &mut Reconstruction, options: &IntrinsicsOp
         let agrees = |other: &&CameraId| {
             let other = &model.cameras[*other];
             (other.width, other.height) == (camera.width, camera.height)
-                && is_told_by_photographs(other)
-                && is_told_by_photographs(camera)
+                && other.focal_source.is_told_by_photographs()
+                && camera.focal_source.is_told_by_photographs()
                 && (other.mean_focal_px() / camera.mean_focal_px()).ln().abs()
                     <= options.agreeing_focal_difference.ln_1p()
         };

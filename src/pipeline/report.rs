@@ -1,6 +1,6 @@
 //! Fills in the report of a run.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use super::features::ImageFeatures;
 use super::intake::Intake;
@@ -12,7 +12,7 @@ use crate::camera::{Camera, FocalSource};
 use crate::coarse::look_alikes::CutPair;
 use crate::formats::report::{InputSummary, LookAlikePair, ModelReport, Report, Software, StageReport};
 use crate::geometry::focal_voting::FocalVotingOptions;
-use crate::scene::{CameraId, ImageId};
+use crate::scene::ImageId;
 
 /// The report of a finished run.
 #[expect(clippy::too_many_arguments, reason = "a report gathers everything a run knows")]
@@ -48,7 +48,8 @@ pub fn build(
 /// Tells of principal points found so far from the middle that programs which hold them there disagree with the model. `models`
 /// are in their final order.
 pub fn principal_point_notes(models: &[ModelState]) -> Vec<String> {
-    let notes = refined_cameras(models).filter_map(|(at, camera)| {
+    let refined = used_cameras(models).filter(|(_, camera)| camera.focal_source != FocalSource::Known);
+    let notes = refined.filter_map(|(at, camera)| {
         let center = camera.principal_point().0;
         let (dx, dy) = (center.x - 0.5 * f64::from(camera.width), center.y - 0.5 * f64::from(camera.height));
         let turn_deg = (dx.hypot(dy) / camera.mean_focal_px()).atan().to_degrees();
@@ -66,8 +67,8 @@ pub fn principal_point_notes(models: &[ModelState]) -> Vec<String> {
 
 /// Tells of focal lengths, not from EXIF, that hardly any lens has: the photographs left them open, and the shape of the model with them.
 pub fn focal_notes(models: &[ModelState], plausible: &FocalVotingOptions) -> Vec<String> {
-    let told = |camera: &Camera| matches!(camera.focal_source, FocalSource::Guess | FocalSource::Estimated);
-    let notes = refined_cameras(models).filter(|(_, camera)| told(camera)).filter_map(|(at, camera)| {
+    let told = used_cameras(models).filter(|(_, camera)| camera.focal_source.is_told_by_photographs());
+    let notes = told.filter_map(|(at, camera)| {
         let ratio = camera.mean_focal_px() / f64::from(camera.width.max(camera.height));
         (!(plausible.min_focal_ratio..=plausible.max_focal_ratio).contains(&ratio)).then(|| {
             format!(
@@ -81,13 +82,10 @@ pub fn focal_notes(models: &[ModelState], plausible: &FocalVotingOptions) -> Vec
     notes.collect()
 }
 
-/// The cameras that images use and that are not known beforehand, with the number of their model.
-fn refined_cameras(models: &[ModelState]) -> impl Iterator<Item = (usize, &Camera)> {
-    let cameras = models.iter().enumerate().flat_map(|(at, account)| {
-        let used: BTreeSet<CameraId> = account.model.images().values().map(|image| image.camera).collect();
-        used.into_iter().map(move |id| (at, &account.model.cameras[&id]))
-    });
-    cameras.filter(|(_, camera)| camera.focal_source != FocalSource::Known)
+/// The cameras that images use, with the number of their model.
+fn used_cameras(models: &[ModelState]) -> impl Iterator<Item = (usize, &Camera)> {
+    let models = models.iter().enumerate();
+    models.flat_map(|(at, account)| account.model.used_cameras().into_values().map(move |camera| (at, camera)))
 }
 
 /// A principal point that far from the middle, seen as an angle, is worth a note.
@@ -127,7 +125,7 @@ mod tests {
     use super::*;
     use crate::camera::CameraModel;
     use crate::geometry::Rigid3;
-    use crate::scene::Reconstruction;
+    use crate::scene::{CameraId, Reconstruction};
 
     #[test]
     fn a_focal_length_that_no_lens_has_is_told() {

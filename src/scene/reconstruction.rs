@@ -78,6 +78,11 @@ impl Reconstruction {
         Self { cameras, ..Self::default() }
     }
 
+    /// The cameras that registered images use, by id.
+    pub fn used_cameras(&self) -> BTreeMap<CameraId, &Camera> {
+        self.images.values().map(|image| (image.camera, &self.cameras[&image.camera])).collect()
+    }
+
     /// The registered images by id.
     pub fn images(&self) -> &BTreeMap<ImageId, RegisteredImage> {
         &self.images
@@ -278,7 +283,9 @@ impl Reconstruction {
         let image = &self.images[&id];
         let camera = &self.cameras[&image.camera];
         let seen = image.points.iter().zip(image.keypoints.iter());
-        seen.filter_map(move |(point, keypoint)| Some(((*point)?, self.error_px(image, camera, (*point)?, keypoint))))
+        seen.filter_map(move |(&point, keypoint)| {
+            point.map(|point| (point, self.error_px(image, camera, point, keypoint)))
+        })
     }
 
     /// The reprojection error of every sighting of every point, image by image.

@@ -8,11 +8,11 @@ use rayon::prelude::*;
 use super::Mapper;
 use crate::bundle::{self, BundleConfig, FreeIntrinsics};
 use crate::camera::{Camera, Pixel};
-use crate::coarse::intrinsics::{add_camera, focal_priors, is_told_by_photographs};
+use crate::coarse::intrinsics::{add_camera, focal_priors};
 use crate::geometry::Rigid3;
 use crate::math::Rng;
 use crate::ransac::absolute_pose;
-use crate::scene::{CameraId, ImageId, KeypointIdx, Observation, Point3dId, Reconstruction};
+use crate::scene::{CameraId, ImageId, KeypointIdx, Point3dId, Reconstruction};
 
 /// Tells the random streams of splitting cameras from others.
 const STREAM: u64 = 0x7370_6c69_745f_6361;
@@ -70,7 +70,7 @@ impl Mapper<'_> {
         if !self.options.intrinsics.refine || !enough {
             return 0;
         }
-        let told = |id: &ImageId| is_told_by_photographs(self.model.camera_of(*id));
+        let told = |id: &ImageId| self.model.camera_of(*id).focal_source.is_told_by_photographs();
         let shared: BTreeMap<ImageId, CameraId> =
             self.model.images().iter().filter(|(id, _)| told(id)).map(|(&id, image)| (id, image.camera)).collect();
         let mut freed = self.model.clone();
@@ -107,9 +107,5 @@ impl Mapper<'_> {
 
 /// The sum of the squared errors of an image's sightings, each at most `limit_px` squared.
 fn squared_errors(model: &Reconstruction, image: ImageId, limit_px: f64) -> f64 {
-    let seen = (0u32..).map(KeypointIdx).zip(model.images()[&image].points());
-    seen.filter_map(|(keypoint, &point)| {
-        Some(model.reprojection_error_px(point?, Observation { image, keypoint }).min(limit_px).powi(2))
-    })
-    .sum()
+    model.errors_of_image_px(image).map(|(_, error_px)| error_px.min(limit_px).powi(2)).sum()
 }

@@ -7,9 +7,7 @@ use std::io::{self, Read, Write};
 
 use nalgebra::Vector3;
 
-use super::{
-    ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, points_with_mean_errors, used_cameras,
-};
+use super::{ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, points_with_mean_errors};
 use crate::camera::{Camera, CameraModel, MAX_PARAMS, Pixel};
 use crate::formats::FormatError;
 use crate::scene::{ImageId, Reconstruction};
@@ -25,7 +23,7 @@ const MAX_NAME_LEN: usize = 1 << 16;
 /// # Errors
 /// When writing fails.
 pub fn write_cameras_bin(model: &Reconstruction, out: &mut impl Write) -> io::Result<()> {
-    let cameras = used_cameras(model);
+    let cameras = model.used_cameras();
     out.write_all(&(cameras.len() as u64).to_le_bytes())?;
     for (id, camera) in cameras {
         out.write_all(&(id.0 + 1).to_le_bytes())?;

@@ -2,7 +2,8 @@
 //!
 //! Ids in the files count from 1: ours plus one. Quaternions are ordered w, x, y, z and turn world into camera, as ours do;
 //! pixels have the centre of the first pixel at (0.5, 0.5), as ours have; so nothing is converted. An image lists all its
-//! keypoints, those without a point too. A point's `error` is the mean reprojection error of its sightings in pixels.
+//! keypoints, those without a point too; cameras that no image uses are left out. A point's `error` is the mean reprojection
+//! error of its sightings in pixels.
 //!
 //! Reference: <https://colmap.github.io/format.html>, "Sparse reconstruction".
 
@@ -18,19 +19,11 @@ pub use text::{
     read_cameras_txt, read_images_txt, read_points3d_txt, write_cameras_txt, write_images_txt, write_points3d_txt,
 };
 
-use std::collections::{BTreeMap, BTreeSet};
-
 use super::FormatError;
 use crate::camera::{Camera, CameraModel, FocalSource, MAX_PARAMS};
 use crate::geometry::Rigid3;
-use crate::scene::{CameraId, Point3d, Point3dId, Reconstruction};
+use crate::scene::{Point3d, Point3dId, Reconstruction};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
-
-/// The cameras that a registered image uses; the others are not written.
-fn used_cameras(model: &Reconstruction) -> BTreeMap<CameraId, &Camera> {
-    let used: BTreeSet<CameraId> = model.images().values().map(|image| image.camera).collect();
-    model.cameras.iter().filter(|(id, _)| used.contains(id)).map(|(&id, camera)| (id, camera)).collect()
-}
 
 /// Every point in order of ids, with the mean reprojection error of its sightings in pixels.
 fn points_with_mean_errors(model: &Reconstruction) -> impl Iterator<Item = (Point3dId, &Point3d, f64)> {

@@ -8,9 +8,7 @@ use std::str::{FromStr, SplitWhitespace};
 
 use nalgebra::Vector3;
 
-use super::{
-    ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, points_with_mean_errors, used_cameras,
-};
+use super::{ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, points_with_mean_errors};
 use crate::camera::{Camera, CameraModel, Pixel};
 use crate::formats::FormatError;
 use crate::scene::{ImageId, Reconstruction};
@@ -21,7 +19,7 @@ use crate::scene::{ImageId, Reconstruction};
 /// When writing fails.
 pub fn write_cameras_txt(model: &Reconstruction, out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "# One camera a line: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]")?;
-    for (id, camera) in used_cameras(model) {
+    for (id, camera) in model.used_cameras() {
         write!(out, "{} {} {} {}", id.0 + 1, camera.model.colmap_name(), camera.width, camera.height)?;
         for param in camera.params() {
             write!(out, " {param}")?;
