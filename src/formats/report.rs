@@ -81,7 +81,7 @@ pub struct LookAlikePair {
     pub matches: usize,
     /// Of those, how many join what the stronger pairs hold for one point too.
     pub agreeing: usize,
-    /// Share of what the photographs show that the pair matches, 0 to 1.
+    /// How much of what the photographs show the pair matches, 0 to 1; what few photographs show counts most.
     pub strength: f64,
     /// The weakest link of the strongest chain of pairs between the two, on the same scale.
     pub chain_strength: f64,

@@ -4,10 +4,11 @@
 //!
 //! Three steps, each cheaper than matching by far:
 //!
-//! 1. **Strength.** Each pair is rated by how much of what its photographs show is matched: of the cells of a grid that hold
-//!    any feature known from some other photograph, the share (intersection over union) with a match in this pair. Photographs of
-//!    one place taken near each other match all over; those of two copies match on the copy alone, however many matches that
-//!    gives: their surroundings are missing correspondences (Zach, Irschara, Bischof, CVPR 2008).
+//! 1. **Strength** ([`strength`]). Each pair is rated by how much of what its photographs show is matched: of the cells of a
+//!    grid that hold any feature known from some other photograph, the share (intersection over union) with a match in this pair,
+//!    the rarer what they hold, the more they weigh. Photographs of one place taken near each other match all over; those of two
+//!    copies match on the copy alone, however many matches that gives: their surroundings are missing correspondences (Zach,
+//!    Irschara, Bischof, CVPR 2008).
 //! 2. **Skeleton** ([`skeleton`]). From the strongest pair on, pairs are taken while the tracks they grow agree. A pair whose
 //!    images stronger pairs connect already, and whose matches the tracks of these do not know, is put off: either the chain
 //!    came back to the same place or the two places look alike.
@@ -44,7 +45,7 @@ pub struct CutPair {
     pub matches: usize,
     /// Of those, how many join keypoints that the stronger pairs hold for one point too.
     pub agreeing: usize,
-    /// Share of what the photographs show that is matched, 0 to 1.
+    /// How much of what the photographs show is matched, 0 to 1; what is seen in few photographs counts most.
     pub strength: f64,
     /// The weakest link of the strongest chain between the two photographs, on the same scale.
     pub chain_strength: f64,

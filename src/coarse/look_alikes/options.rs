@@ -9,7 +9,8 @@ pub struct LookAlikeOptions {
     /// Whether pairs are checked at all.
     pub enabled: bool,
     /// Cells along the longer side of an image for rating how much of it a pair matches. More cells follow small surroundings
-    /// better; with too many, a feature lost by chance looks like missing surroundings.
+    /// better; with too many, a feature lost by chance looks like missing surroundings. Measured on random subsets of two sets of
+    /// look-alikes: 9 to 14 do alike, 16 and more and 6 and less worse.
     pub grid_cells: u32,
     /// A pair whose images stronger pairs connect already is taken without doubt when at least this share of its matches joins keypoints that the stronger pairs hold
     /// for one point too, of those whose keypoints both are in tracks of the stronger pairs. Raising it doubts more pairs; those
@@ -35,7 +36,7 @@ impl Default for LookAlikeOptions {
     fn default() -> Self {
         Self {
             enabled: true,
-            grid_cells: 16,
+            grid_cells: 12,
             agreeing_share: 0.6,
             joining_share: 0.8,
             alarming_share: 0.25,
