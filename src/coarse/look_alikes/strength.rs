@@ -112,8 +112,8 @@ impl<'a> Shown<'a> {
         let is_expected = |&(column, row): &Cell| {
             let middle_px = Vector2::new(f64::from(column) + 0.5, f64::from(row) + 0.5) * self.cell_px;
             // Matches on a line tell no map; nothing is excused then.
-            other_from_own.as_ref().is_none_or(|map| {
-                let in_other = map(middle_px);
+            other_from_own.is_none_or(|(linear, offset)| {
+                let in_other = linear * middle_px + offset;
                 (0.0..other.size_px.x).contains(&in_other.x) && (0.0..other.size_px.y).contains(&in_other.y)
             })
         };
@@ -128,10 +128,10 @@ impl<'a> Shown<'a> {
     }
 }
 
-/// The affine map that takes points nearest to others, by least squares; none where the points lie on a line.
+/// The affine map, a matrix and an offset, that takes points nearest to others, by least squares; none where the points lie on a line.
 ///
 /// With p and q the points less their means, the sum of |q - M p|² is least where M Σ p pᵀ = Σ q pᵀ.
-fn affine(from: &[Vector2<f64>], to: &[Vector2<f64>]) -> Option<impl Fn(Vector2<f64>) -> Vector2<f64> + use<>> {
+fn affine(from: &[Vector2<f64>], to: &[Vector2<f64>]) -> Option<(Matrix2<f64>, Vector2<f64>)> {
     let mean = |points: &[Vector2<f64>]| points.iter().sum::<Vector2<f64>>() / points.len() as f64;
     let (mean_from, mean_to) = (mean(from), mean(to));
     let (mut spread, mut joint) = (Matrix2::zeros(), Matrix2::zeros());
@@ -141,7 +141,7 @@ fn affine(from: &[Vector2<f64>], to: &[Vector2<f64>]) -> Option<impl Fn(Vector2<
         joint += q * p.transpose();
     }
     let linear = joint * spread.try_inverse()?;
-    Some(move |point| linear * (point - mean_from) + mean_to)
+    Some((linear, mean_to - linear * mean_from))
 }
 
 /// In how many pairs every keypoint of every matched image is. None once `keep_going` says no.
@@ -169,9 +169,9 @@ mod tests {
     fn an_affine_map_is_found_and_a_line_tells_none() {
         let from = [(0.0, 0.0), (3.0, 1.0), (1.0, 4.0), (7.0, 2.0)].map(|(x, y)| Vector2::new(x, y));
         let truth = |p: Vector2<f64>| Vector2::new(0.5 * p.x - p.y + 7.0, 2.0 * p.x + 0.3 * p.y - 1.0);
-        let map = affine(&from, &from.map(truth)).unwrap();
+        let (linear, offset) = affine(&from, &from.map(truth)).unwrap();
         let at = Vector2::new(-5.0, 11.0);
-        assert!((map(at) - truth(at)).norm() < 1e-12);
+        assert!((linear * at + offset - truth(at)).norm() < 1e-12);
         let line = [0.0, 1.0, 2.0].map(|x| Vector2::new(x, 0.0));
         assert!(affine(&line, &line).is_none());
     }
