@@ -83,6 +83,7 @@ fn upward_imports_are_found() {
     assert_eq!(found("use crate::{math::Rng, pipeline::{Context, Stage}, jobs};"), 3);
     assert_eq!(found("pub(crate) use crate::formats;"), 1);
     assert_eq!(found("fn f() -> crate::store::Key { let x = crate::math::f(crate::http::g()); x }"), 2);
+    assert_eq!(found("fn f<'a>() -> impl Fn() + use<'a> { crate::store::key }"), 1);
     assert_eq!(found("use super::super::pipeline::Context;"), 1, "super may reach another layer through the root");
     assert_eq!(found("use super::super::bundle::Problem;"), 0);
     assert_eq!(found("mod inner { use super::super::super::jobs::State; use super::super::select; }"), 1);
@@ -286,7 +287,8 @@ fn paths(module: &[String], tokens: &[String]) -> Vec<Vec<String>> {
                     inline.pop();
                 }
             }
-            "use" => {
+            // Not the captures of a type, `impl Trait + use<..>`.
+            "use" if tokens.get(i + 1).is_none_or(|t| t != "<") => {
                 let here: Vec<String> =
                     module.iter().cloned().chain(inline.iter().map(|(name, _)| name.clone())).collect();
                 let mut trees = Vec::new();

@@ -128,7 +128,8 @@ impl<'a> Shown<'a> {
     }
 }
 
-/// The affine map, a matrix and an offset, that takes points nearest to others, by least squares; none where the points lie on a line.
+/// The affine map, a matrix and an offset, that takes points nearest to others, by least squares; none where the points lie on
+/// a line.
 ///
 /// With p and q the points less their means, the sum of |q - M p|² is least where M Σ p pᵀ = Σ q pᵀ.
 fn affine(from: &[Vector2<f64>], to: &[Vector2<f64>]) -> Option<(Matrix2<f64>, Vector2<f64>)> {
