@@ -4,8 +4,8 @@
 //!
 //! Three steps, each cheaper than matching by far:
 //!
-//! 1. **Strength** ([`strength`]). Each pair is rated by how much of what its photographs show is matched: of the cells of a
-//!    grid that hold any feature known from some other photograph, the share (intersection over union) with a match in this pair,
+//! 1. **Strength** ([`strength`]). Each pair is rated by how much of what its photographs show is matched: of the places that
+//!    hold any feature known from some other photograph, the share (intersection over union) with a match of this pair near by,
 //!    the rarer what they hold, the more they weigh. Photographs of one place taken near each other match all over; those of two
 //!    copies match on the copy alone, however many matches that gives: their surroundings are missing correspondences (Zach,
 //!    Irschara, Bischof, CVPR 2008).

@@ -8,10 +8,10 @@ use serde::{Deserialize, Serialize};
 pub struct LookAlikeOptions {
     /// Whether pairs are checked at all.
     pub enabled: bool,
-    /// Windows along the longer side of an image for rating how much of it a pair matches; a match counts for the window around
-    /// it. More follow small surroundings better; with too many, a feature lost by chance looks like missing surroundings.
-    /// Measured on random subsets of three sets of look-alikes: 8 to 12 do alike, more do worse.
-    pub windows: u32,
+    /// Cells along the longer side of an image for rating how much of it a pair matches: a match counts for a window of that
+    /// size around it. More follow small surroundings better; with too many, a feature lost by chance looks like missing
+    /// surroundings. Measured on random subsets of three sets of look-alikes: 8 to 12 do alike, more do worse.
+    pub grid_cells: u32,
     /// A pair whose images stronger pairs connect already is taken without doubt when at least this share of its matches joins keypoints that the stronger pairs hold
     /// for one point too, of those whose keypoints both are in tracks of the stronger pairs. Raising it doubts more pairs; those
     /// that are true are kept all the same, for the price of a second coarse model.
@@ -36,7 +36,7 @@ impl Default for LookAlikeOptions {
     fn default() -> Self {
         Self {
             enabled: true,
-            windows: 12,
+            grid_cells: 12,
             agreeing_share: 0.6,
             joining_share: 0.8,
             alarming_share: 0.25,
@@ -55,7 +55,7 @@ impl LookAlikeOptions {
                 errors.push(format!("coarse.look_alikes.{message}"));
             }
         };
-        check((2..=1000).contains(&self.windows), "windows must be from 2 to 1000");
+        check((2..=1000).contains(&self.grid_cells), "grid_cells must be from 2 to 1000");
         for (name, value) in [
             ("agreeing_share", self.agreeing_share),
             ("joining_share", self.joining_share),

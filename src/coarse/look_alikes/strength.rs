@@ -9,7 +9,7 @@ use crate::bundle::KeepGoing;
 use crate::coarse::MapperInput;
 use crate::scene::{ImageId, KeypointIdx};
 
-/// Cells of the fine grid along a side of a window.
+/// Cells of the fine grid along a side of a window, which is odd.
 const WINDOW_CELLS: usize = 3;
 
 /// The strength of every pair, 0 to 1: the geometric mean of two intersections over unions of what its photographs show, one
@@ -43,7 +43,7 @@ pub(super) fn strengths(
     let pairs_of_keypoints = pairs_of_keypoints(input, keep_going)?;
     let shown: BTreeMap<ImageId, Shown> = pairs_of_keypoints
         .into_iter()
-        .map(|(image, pairs)| (image, Shown::new(input, image, &pairs, options.windows)))
+        .map(|(image, pairs)| (image, Shown::new(input, image, &pairs, options.grid_cells)))
         .collect();
     let mut strengths = BTreeMap::new();
     for (&(a, b), geometry) in &input.graph.pairs {
@@ -74,9 +74,9 @@ struct Grid {
 }
 
 impl Grid {
-    /// With so many windows along the longer side.
-    fn new(size_px: Vector2<f64>, windows: u32) -> Self {
-        let cell_px = size_px.max() / (f64::from(windows) * WINDOW_CELLS as f64);
+    /// With windows of which so many fit along the longer side.
+    fn new(size_px: Vector2<f64>, grid_cells: u32) -> Self {
+        let cell_px = size_px.max() / (f64::from(grid_cells) * WINDOW_CELLS as f64);
         let cells = |length_px: f64| ((length_px / cell_px).ceil() as usize).max(1);
         Self { cell_px, columns: cells(size_px.x), rows: cells(size_px.y) }
     }
@@ -123,11 +123,11 @@ struct Shares {
 
 impl Shown {
     /// From the number of pairs that match each of its keypoints.
-    fn new(input: &MapperInput, image: ImageId, pairs_of_keypoint: &[u32], windows: u32) -> Self {
+    fn new(input: &MapperInput, image: ImageId, pairs_of_keypoint: &[u32], grid_cells: u32) -> Self {
         let image = &input.images[&image];
         let camera = &input.cameras[&image.camera];
         let size_px = Vector2::new(f64::from(camera.width), f64::from(camera.height));
-        let grid = Grid::new(size_px, windows);
+        let grid = Grid::new(size_px, grid_cells);
         let mut commonest = vec![0; grid.len()];
         for (keypoint, &pairs) in image.keypoints.iter().zip(pairs_of_keypoint) {
             let cell = grid.cell(keypoint.0);
@@ -203,6 +203,101 @@ fn pairs_of_keypoints(input: &MapperInput, keep_going: &KeepGoing) -> Option<BTr
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::{Camera, CameraModel, FocalSource, Pixel};
+    use crate::coarse::{MapperImage, MatchGraph};
+    use crate::matching::two_view::{TwoViewConfig, TwoViewGeometry};
+    use crate::scene::{ApartImages, CameraId};
+
+    const SIZE_PX: (u32, u32) = (1000, 800);
+
+    /// A rectangle full of features: left, top, width, height.
+    type Patch = (f64, f64, f64, f64);
+
+    /// The strengths of pairs of photographs, which show patches; those of one number look alike in all of them.
+    fn rated(photographs: &[&[(usize, Patch)]]) -> BTreeMap<(ImageId, ImageId), f64> {
+        // A feature is its patch, and its column and row there.
+        let features = |patches: &[(usize, Patch)]| -> Vec<((usize, u32, u32), Pixel)> {
+            let of_patch = |&(number, (left, top, width, height)): &(usize, Patch)| {
+                let places = (0..(height / 20.0) as u32).flat_map(move |row| {
+                    (0..(width / 20.0) as u32)
+                        .map(move |column| (column, row, left + 20.0 * f64::from(column), top + 20.0 * f64::from(row)))
+                });
+                places
+                    .filter(|&(_, _, x, y)| (0.0..f64::from(SIZE_PX.0)).contains(&x) && y < f64::from(SIZE_PX.1))
+                    .map(move |(column, row, x, y)| ((number, column, row), Pixel::new(x, y)))
+                    .collect::<Vec<_>>()
+            };
+            patches.iter().flat_map(of_patch).collect()
+        };
+        let shown: Vec<Vec<((usize, u32, u32), Pixel)>> = photographs.iter().map(|patches| features(patches)).collect();
+        let mut graph = MatchGraph::default();
+        for (a, in_a) in shown.iter().enumerate() {
+            for (b, in_b) in shown.iter().enumerate().skip(a + 1) {
+                let same = |(at, (feature, _)): (usize, &((usize, u32, u32), Pixel))| {
+                    let other = in_b.iter().position(|(other, _)| other == feature)?;
+                    Some((KeypointIdx(at as u32), KeypointIdx(other as u32)))
+                };
+                let inliers: Vec<_> = in_a.iter().enumerate().filter_map(same).collect();
+                if !inliers.is_empty() {
+                    let geometry = TwoViewGeometry {
+                        config: TwoViewConfig::Planar,
+                        inliers,
+                        fundamental: None,
+                        essential: None,
+                        homography: None,
+                        b_from_a: None,
+                        median_triangulation_angle_rad: None,
+                        num_e_inliers: 0,
+                        num_f_inliers: 0,
+                        num_h_inliers: 0,
+                    };
+                    graph.pairs.insert((ImageId(a as u32), ImageId(b as u32)), geometry);
+                }
+            }
+        }
+        let camera = Camera::centered(CameraModel::SimpleRadial, SIZE_PX.0, SIZE_PX.1, 900.0, FocalSource::Exif);
+        let images = shown.iter().enumerate().map(|(id, features)| {
+            let keypoints = features.iter().map(|(_, at)| *at).collect();
+            (ImageId(id as u32), MapperImage { camera: CameraId(0), keypoints })
+        });
+        let input = MapperInput {
+            images: images.collect(),
+            cameras: BTreeMap::from([(CameraId(0), camera)]),
+            graph,
+            apart: ApartImages::default(),
+        };
+        strengths(&input, &LookAlikeOptions::default(), &|| true).unwrap()
+    }
+
+    /// Where the lines of the grid fall must not matter: everything is moved by as much as this.
+    const MOVES_PX: [f64; 4] = [0.0, 7.0, 14.0, 21.0];
+
+    #[test]
+    fn what_few_photographs_show_outweighs_a_copied_front_that_fills_the_picture() {
+        for at in MOVES_PX {
+            let front = (0, (100.0 + at, 100.0, 800.0, 400.0));
+            let (bin, bush) = ((1, (100.0 + at, 600.0, 300.0, 150.0)), (2, (500.0 + at, 600.0, 300.0, 150.0)));
+            // Two photographs of one front, half of which something hides in the second; three of a copy elsewhere.
+            let half_front = (0, (100.0 + at, 100.0, 400.0, 400.0));
+            let found = rated(&[&[front, bin], &[half_front, bin], &[front, bush], &[front, bush], &[front, bush]]);
+            let (true_one, wrong) = (found[&(ImageId(0), ImageId(1))], found[&(ImageId(0), ImageId(2))]);
+            assert!(true_one > 1.05 * wrong, "moved by {at}: {true_one} and {wrong}");
+        }
+    }
+
+    #[test]
+    fn what_left_the_frame_counts_little_against_a_pair() {
+        for at in MOVES_PX {
+            let front = (0, (100.0 + at, 100.0, 800.0, 400.0));
+            let (bin, bush) = ((1, (100.0 + at, 600.0, 250.0, 100.0)), (2, (500.0 + at, 600.0, 250.0, 100.0)));
+            // The second photograph was taken a step to the left.
+            let aside =
+                |(number, (left, top, width, height)): (usize, Patch)| (number, (left + 500.0, top, width, height));
+            let found = rated(&[&[front, bin], &[aside(front), aside(bin)], &[front, bush], &[front, bush]]);
+            let (true_one, wrong) = (found[&(ImageId(0), ImageId(1))], found[&(ImageId(0), ImageId(2))]);
+            assert!(true_one > 1.05 * wrong, "moved by {at}: {true_one} and {wrong}");
+        }
+    }
 
     #[test]
     fn an_affine_map_is_found_and_a_line_tells_none() {
