@@ -213,10 +213,12 @@ mod tests {
     /// A rectangle full of features: left, top, width, height.
     type Patch = (f64, f64, f64, f64);
 
+    /// What a feature looks like: its patch, and its column and row there.
+    type Look = (usize, u32, u32);
+
     /// The strengths of pairs of photographs, which show patches; those of one number look alike in all of them.
     fn rated(photographs: &[&[(usize, Patch)]]) -> BTreeMap<(ImageId, ImageId), f64> {
-        // A feature is its patch, and its column and row there.
-        let features = |patches: &[(usize, Patch)]| -> Vec<((usize, u32, u32), Pixel)> {
+        let features = |patches: &[(usize, Patch)]| -> Vec<(Look, Pixel)> {
             let of_patch = |&(number, (left, top, width, height)): &(usize, Patch)| {
                 let places = (0..(height / 20.0) as u32).flat_map(move |row| {
                     (0..(width / 20.0) as u32)
@@ -229,11 +231,11 @@ mod tests {
             };
             patches.iter().flat_map(of_patch).collect()
         };
-        let shown: Vec<Vec<((usize, u32, u32), Pixel)>> = photographs.iter().map(|patches| features(patches)).collect();
+        let shown: Vec<Vec<(Look, Pixel)>> = photographs.iter().map(|patches| features(patches)).collect();
         let mut graph = MatchGraph::default();
         for (a, in_a) in shown.iter().enumerate() {
             for (b, in_b) in shown.iter().enumerate().skip(a + 1) {
-                let same = |(at, (feature, _)): (usize, &((usize, u32, u32), Pixel))| {
+                let same = |(at, (feature, _)): (usize, &(Look, Pixel))| {
                     let other = in_b.iter().position(|(other, _)| other == feature)?;
                     Some((KeypointIdx(at as u32), KeypointIdx(other as u32)))
                 };
