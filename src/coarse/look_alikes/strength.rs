@@ -31,7 +31,7 @@ const WINDOW_CELLS: usize = 3;
 /// (Zach, Irschara, Bischof, CVPR 2008).
 ///
 /// Measured on 32 random subsets each (half or six tenths of the photographs) of three sets of look-alikes: a wrong pair was
-/// among the strongest that connect them all in 3, 0 and 2. On a plain grid of 9 to 14 cells it was in 5 to 8, 0 or 1, and 1 to
+/// among the strongest that connect them all in 3, 0 and 2. On a plain grid of 9 or 12 cells it was in 5 to 8, 0 or 1, and 1 to
 /// 25, as its lines fell.
 ///
 /// None once `keep_going`, which is asked for every pair, says no.
