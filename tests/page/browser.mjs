@@ -42,3 +42,21 @@ export async function distinctColours(page, locator) {
     return new Set(new Uint32Array(context.getImageData(0, 0, image.width, image.height).data.buffer)).size;
   }, png);
 }
+
+/** How many colours a canvas has in the very frame in which its height changes, after those that observe it were told. */
+export async function coloursOnResize(locator, height) {
+  return locator.evaluate((shown, to) => new Promise((resolve) => {
+    const before = shown.clientHeight;
+    new ResizeObserver((_, observer) => {
+      if (shown.clientHeight === before) return;
+      observer.disconnect();
+      const canvas = document.createElement("canvas");
+      canvas.width = shown.width;
+      canvas.height = shown.height;
+      const context = canvas.getContext("2d");
+      context.drawImage(shown, 0, 0);
+      resolve(new Set(new Uint32Array(context.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size);
+    }).observe(shown);
+    shown.style.height = `${to}px`;
+  }), height);
+}

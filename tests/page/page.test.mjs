@@ -4,7 +4,7 @@ import { mkdir, mkdtemp, readFile, rm, writeFile } from "node:fs/promises";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { distinctColours, noBrowser, openBrowser, openPage } from "./browser.mjs";
+import { coloursOnResize, distinctColours, noBrowser, openBrowser, openPage } from "./browser.mjs";
 import { startMock } from "./mock.mjs";
 
 const skip = noBrowser;
@@ -94,6 +94,8 @@ test("a folder goes up with its sub-folders and becomes a model on the canvas", 
   assert.notEqual(await look(), without);
   await page.selectOption("#which-model", "1");
   await page.locator('.viewer[data-state="shown"]').waitFor();
+  const resized = await coloursOnResize(canvas, 300);
+  assert.ok(resized > 500, `a canvas whose size changes shows only ${resized} colours`);
 
   await page.getByText("The scale is arbitrary").waitFor();
   await page.getByRole("button", { name: "all 6" }).click();

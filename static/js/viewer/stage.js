@@ -233,16 +233,22 @@ export class Stage {
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.material.uniforms.size.value = this.pointSize * ratio;
-    this.draw();
+    // At once: a canvas whose size is set is empty, and would be shown so until the next frame.
+    this.render();
   }
 
+  /** Asks for the next frame to show the scene as it is then. */
   draw() {
     this.pending ??= requestAnimationFrame(() => {
       this.pending = null;
-      // Damping moves the view on, which asks for the next frame.
-      this.controls.update();
-      this.renderer.render(this.scene, this.camera);
+      this.render();
     });
+  }
+
+  render() {
+    // Damping moves the view on, which asks for the next frame.
+    this.controls.update();
+    this.renderer.render(this.scene, this.camera);
   }
 
   clear() {
