@@ -27,12 +27,31 @@ export async function openPage(browser, url, options = {}) {
   return { page, errors };
 }
 
-/** How many colours a part of the page shows, from its screenshot; read back in the page itself, which can decode PNG. */
+/** How many colours a part of the page shows, from its screenshot. */
 export async function distinctColours(page, locator) {
   const png = (await locator.screenshot()).toString("base64");
-  return page.evaluate(async (data) => {
+  return coloursOf(page, `data:image/png;base64,${png}`);
+}
+
+/** How many colours a canvas has in the very frame in which its height changes, after those that observe it were told. */
+export async function coloursOnResize(page, canvas, height) {
+  const png = await canvas.evaluate((shown, to) => new Promise((resolve) => {
+    const before = shown.clientHeight;
+    new ResizeObserver((_, observer) => {
+      if (shown.clientHeight === before) return;
+      observer.disconnect();
+      resolve(shown.toDataURL());
+    }).observe(shown);
+    shown.style.height = `${to}px`;
+  }), height);
+  return coloursOf(page, png);
+}
+
+/** The number of colours of a PNG, a data URL; counted in the page, which can decode it. */
+function coloursOf(page, png) {
+  return page.evaluate(async (url) => {
     const image = new Image();
-    image.src = `data:image/png;base64,${data}`;
+    image.src = url;
     await image.decode();
     const canvas = document.createElement("canvas");
     canvas.width = image.width;
@@ -41,22 +60,4 @@ export async function distinctColours(page, locator) {
     context.drawImage(image, 0, 0);
     return new Set(new Uint32Array(context.getImageData(0, 0, image.width, image.height).data.buffer)).size;
   }, png);
-}
-
-/** How many colours a canvas has in the very frame in which its height changes, after those that observe it were told. */
-export async function coloursOnResize(locator, height) {
-  return locator.evaluate((shown, to) => new Promise((resolve) => {
-    const before = shown.clientHeight;
-    new ResizeObserver((_, observer) => {
-      if (shown.clientHeight === before) return;
-      observer.disconnect();
-      const canvas = document.createElement("canvas");
-      canvas.width = shown.width;
-      canvas.height = shown.height;
-      const context = canvas.getContext("2d");
-      context.drawImage(shown, 0, 0);
-      resolve(new Set(new Uint32Array(context.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size);
-    }).observe(shown);
-    shown.style.height = `${to}px`;
-  }), height);
 }

@@ -94,7 +94,7 @@ test("a folder goes up with its sub-folders and becomes a model on the canvas", 
   assert.notEqual(await look(), without);
   await page.selectOption("#which-model", "1");
   await page.locator('.viewer[data-state="shown"]').waitFor();
-  const resized = await coloursOnResize(canvas, 300);
+  const resized = await coloursOnResize(page, canvas, 300);
   assert.ok(resized > 500, `a canvas whose size changes shows only ${resized} colours`);
 
   await page.getByText("The scale is arbitrary").waitFor();

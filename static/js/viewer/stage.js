@@ -97,7 +97,13 @@ export class Stage {
 
   setPointSize(pixels) {
     this.pointSize = pixels;
-    this.resize();
+    this.scalePoints();
+    this.draw();
+  }
+
+  /** Points are sized in CSS pixels. */
+  scalePoints() {
+    this.material.uniforms.size.value = this.pointSize * this.renderer.getPixelRatio();
   }
 
   showCameras(visible) {
@@ -227,12 +233,11 @@ export class Stage {
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0) return;
-    const ratio = Math.min(devicePixelRatio, 2);
-    this.renderer.setPixelRatio(ratio);
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
-    this.material.uniforms.size.value = this.pointSize * ratio;
+    this.scalePoints();
     // At once: a canvas whose size is set is empty, and would be shown so until the next frame.
     this.render();
   }
