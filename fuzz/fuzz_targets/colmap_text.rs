@@ -1,6 +1,6 @@
 #![no_main]
 
-#[path = "../../tests/parsers/targets.rs"]
+#[path = "../../tests/service/parsers/targets.rs"]
 mod targets;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| targets::run("colmap_text", bytes));

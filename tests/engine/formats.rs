@@ -1,0 +1,5 @@
+//! Formats seen from outside.
+
+mod models;
+mod photographs;
+mod report_html;
