@@ -46,6 +46,9 @@ impl Normalized {
     }
 }
 
+/// Focal length of a photograph of which nothing is known, as a share of its longer side: it sees 45 degrees. COLMAP's.
+pub const TYPICAL_FOCAL: f64 = 1.2;
+
 /// Where a focal length comes from, and so how far it is trusted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::bundle::{FocalPrior, FreeIntrinsics};
-use crate::camera::{Camera, CameraModel, FocalSource};
+use crate::camera::{Camera, CameraModel, FocalSource, TYPICAL_FOCAL};
 use crate::scene::{CameraId, ImageId, Reconstruction};
 
 /// How many images sharing a camera it takes to free its parameters.
@@ -32,7 +32,7 @@ pub struct IntrinsicsOptions {
     pub min_images_for_opencv: Option<usize>,
     /// Whether intrinsics are refined at all (known ones never are).
     pub refine: bool,
-    /// The focal length that photographs without EXIF are expected to have, as a share of the longer side: 1.2 sees 45 degrees.
+    /// The focal length that photographs without EXIF are expected to have, as a share of the longer side: [`TYPICAL_FOCAL`].
     pub typical_focal: f64,
     /// Standard deviation of its logarithm; null leaves such focal lengths without a prior. It covers wide lenses and short
     /// telephotos, and weighs no more than one sighting, so it decides only where the sightings leave a focal length open: of
@@ -82,7 +82,7 @@ impl Default for IntrinsicsOptions {
             min_images_for_radial: 4,
             min_images_for_opencv: None,
             refine: true,
-            typical_focal: 1.2,
+            typical_focal: TYPICAL_FOCAL,
             typical_focal_sigma_log: Some(0.5),
             agreeing_focal_difference: 0.04,
         }

@@ -9,7 +9,7 @@ use super::focals::FocalOptions;
 use crate::add_cameras::AddCamerasOptions;
 use crate::add_points::{AddPointsOptions, StrayOptions};
 use crate::bundle::BundleOptions;
-use crate::camera::CameraModel;
+use crate::camera::{CameraModel, TYPICAL_FOCAL};
 use crate::coarse::MapperOptions;
 use crate::coarse::hybrid_match::HybridMatchOptions;
 use crate::coarse::look_alikes::LookAlikeOptions;
@@ -65,7 +65,7 @@ pub struct IntakeOptions {
     pub min_side_px: u32,
     /// Pictures of more million pixels are rejected from the header, before they are decoded.
     pub max_megapixels: f64,
-    /// Focal length, in units of the long side, assumed where nothing is known; COLMAP's 1.2.
+    /// Focal length, in units of the long side, assumed where nothing is known: [`TYPICAL_FOCAL`].
     pub default_focal: f64,
     /// Intrinsics known for every picture.
     pub camera: Option<KnownCamera>,
@@ -82,7 +82,7 @@ impl Default for IntakeOptions {
             max_long_side_px: 3200,
             min_side_px: 32,
             max_megapixels: 250.0,
-            default_focal: 1.2,
+            default_focal: TYPICAL_FOCAL,
             camera: None,
             cameras: BTreeMap::new(),
             ready_features: false,

@@ -3,8 +3,9 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::program::Program;
 use serde_json::Value;
+
+use crate::program::Program;
 
 /// From the answer to the cancel to the state `cancelled`.
 const STOPPED: Duration = Duration::from_secs(5);

@@ -12,7 +12,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use crate::program::Program;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use multistage::store::db::datasets;
@@ -22,6 +21,8 @@ use multistage::store::{DataDir, Db};
 use reqwest::{Body, Client, Response};
 use serde_json::{Value, json};
 use tokio::sync::watch;
+
+use crate::program::Program;
 
 /// Clients that upload, and clients that listen.
 const SENDERS: usize = 50;

@@ -7,10 +7,11 @@
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use crate::service::{Service, photographs};
 use multistage::config::ConnectionLimits;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
+
+use crate::service::{Service, photographs};
 
 /// What the attack may cost, its own end in the same process included.
 const RSS_GROWTH_BYTES: u64 = 100 << 20;

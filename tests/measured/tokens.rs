@@ -8,9 +8,10 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-use crate::program::Program;
 use multistage::store::db::tokens::{self, TokenRow};
 use multistage::store::{Db, find_token};
+
+use crate::program::Program;
 
 /// Trials of an ordinary run.
 const TRIALS: usize = 10_000;

@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::Duration;
 
-use crate::program::Program;
 use multistage::store::{DataDir, Db, Scope, create_token};
 use reqwest::multipart::{Form, Part};
 use serde_json::Value;
+
+use crate::program::Program;
 
 /// Examples per operation of an ordinary test run.
 const EXAMPLES: &str = "15";

@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use serde_json::{Value, json};
+
 use crate::program::Program;
 use crate::service::{FakeEngine, Service, file, files_below, photographs};
-use serde_json::{Value, json};
 
 /// The data directory as a crash at this moment would leave it.
 fn crash_image(service: &Service) -> tempfile::TempDir {

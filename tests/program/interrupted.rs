@@ -3,8 +3,9 @@
 
 use std::time::{Duration, Instant};
 
-use crate::program::Program;
 use serde_json::{Value, json};
+
+use crate::program::Program;
 
 /// More lives than a job may take.
 const TOO_MANY: usize = 15;

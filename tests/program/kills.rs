@@ -8,7 +8,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crate::program::Program;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use multistage::math::Rng;
@@ -16,6 +15,8 @@ use reqwest::{Response, StatusCode};
 use serde_json::{Value, json};
 use sha2::Digest;
 use tokio::sync::watch;
+
+use crate::program::Program;
 
 /// Kills of an ordinary test run.
 const KILLS: usize = 40;

@@ -11,7 +11,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use crate::program::Program;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use futures_util::StreamExt;
@@ -20,6 +19,8 @@ use record::{CALLS, Disk, Line, parse};
 use reqwest::{Client, RequestBuilder, Response};
 use serde_json::{Value, json};
 use sha2::Digest;
+
+use crate::program::Program;
 
 /// Power cuts of an ordinary run.
 const CUTS: usize = 10;

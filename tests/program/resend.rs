@@ -5,7 +5,6 @@
 use std::collections::BTreeMap;
 use std::io::{Cursor, Write};
 
-use crate::program::Program;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use futures_util::StreamExt;
@@ -14,6 +13,8 @@ use serde_json::{Value, json};
 use sha2::Digest;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
+
+use crate::program::Program;
 
 /// Photographs of the set.
 const FILES: usize = 24;

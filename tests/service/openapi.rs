@@ -2,9 +2,10 @@
 
 use std::collections::BTreeSet;
 
+use multistage::http::Code;
+
 use crate::service::Service;
 use crate::service::contract::Contract;
-use multistage::http::Code;
 
 /// Every route in the source: path and methods, as `get /path`.
 fn routes_in_source() -> BTreeSet<String> {

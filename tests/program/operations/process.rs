@@ -35,7 +35,7 @@ async fn a_signal_stops_the_program_in_time_and_its_job_goes_on_after() {
     let (data, log) = (folder.path().join("data"), folder.path().join("log"));
     let mut program = serve(&data, std::fs::File::create(&log).unwrap());
     let base = program.base.clone();
-    let form = (0..12)
+    let form = (0..6)
         .fold(reqwest::multipart::Form::new(), |form, n| form.part("images", file(&format!("{n}.jpg"), &noise(n + 1))));
     let sent = reqwest::Client::new().post(format!("{base}/api/v1/jobs")).multipart(form).send().await.unwrap();
     let request_id = sent.headers()["x-request-id"].to_str().unwrap().to_owned();
