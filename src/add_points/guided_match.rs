@@ -20,6 +20,7 @@ use super::epipolar::EpipolarGeometry;
 use super::one_way::{Found, OneWay};
 use super::options::GuidedMatchOptions;
 use super::prepared::PreparedImage;
+use crate::matching::standing;
 use crate::math::Rng;
 use crate::scene::{ImageId, KeypointIdx};
 
@@ -81,6 +82,7 @@ pub fn guided_match(
     }
     gate_by_geometry(&mut matches, first, second, &geometry, options);
     gate_by_orientation(&mut matches, first, second, options);
+    leave_out_standing(&mut matches, first, second, options);
     if matches.len() < options.min_pair_matches {
         return Vec::new();
     }
@@ -125,6 +127,27 @@ fn gate_by_geometry(
         let actual = f64::from(second.features.keypoints[b].scale) / f64::from(first.features.keypoints[a].scale);
         options.max_scale_discrepancy.is_none_or(|factor| (actual / expected).ln().abs() <= factor.ln())
     });
+}
+
+/// Drops matches that stand still in the frame where they are no part of the scene.
+fn leave_out_standing(
+    matches: &mut Vec<Found>,
+    first: &PreparedImage,
+    second: &PreparedImage,
+    options: &GuidedMatchOptions,
+) {
+    if !first.camera.has_size_of(&second.camera) {
+        return;
+    }
+    let shift_px = |found: &Found| {
+        let (a, b) =
+            (&first.features.keypoints[found.query as usize], &second.features.keypoints[found.target as usize]);
+        f64::from(b.x - a.x).hypot(f64::from(b.y - a.y))
+    };
+    let shifts_px: Vec<f64> = matches.iter().map(shift_px).collect();
+    let Some(moved) = standing::moved(&shifts_px, &options.standing) else { return };
+    let mut moved = moved.into_iter();
+    matches.retain(|_| moved.next().unwrap_or(true));
 }
 
 /// Bins of the histogram of orientation changes: 10 degrees each.

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::candidate_search::CandidateSearch;
 use crate::camera::Camera;
+use crate::matching::standing::StandingOptions;
 
 /// Everything that steers the addition of points.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -105,6 +106,9 @@ pub struct GuidedMatchOptions {
     pub ratio_both_ways: bool,
     /// Whether a match must triangulate in front of both cameras.
     pub cheirality: bool,
+    /// Which matches are no part of the scene, as they stand still in the frame: an epipolar line that lies along the motion does not
+    /// tell them from others.
+    pub standing: StandingOptions,
     /// Largest factor by which the ratio of both keypoints' scales may differ from the one their depths foretell; none
     /// turns the gate off.
     pub max_scale_discrepancy: Option<f64>,
@@ -130,6 +134,7 @@ impl Default for GuidedMatchOptions {
             mutual: true,
             ratio_both_ways: false,
             cheirality: true,
+            standing: StandingOptions::default(),
             max_scale_discrepancy: Some(3.0),
             max_orientation_discrepancy_deg: Some(60.0),
             min_pair_matches: 16,
@@ -139,6 +144,7 @@ impl Default for GuidedMatchOptions {
 
 impl GuidedMatchOptions {
     fn validate(&self, errors: &mut Vec<String>) {
+        self.standing.validate(errors);
         require(self.band_px > 0.0, "guided_match.band_px must be positive", errors);
         require(self.group_tolerance_px >= 0.0, "guided_match.group_tolerance_px must not be negative", errors);
         require(self.cell_half_size_bands >= 1.0, "guided_match.cell_half_size_bands must be at least 1", errors);

@@ -108,6 +108,11 @@ impl Camera {
         camera
     }
 
+    /// Whether pictures of both are of one size.
+    pub fn has_size_of(&self, other: &Self) -> bool {
+        (self.width, self.height) == (other.width, other.height)
+    }
+
     /// The parameters of the model, in COLMAP's order.
     pub fn params(&self) -> &[f64] {
         &self.params[..self.model.num_params()]

@@ -123,8 +123,7 @@ pub fn cameras_to_share(model: &Reconstruction, group: CameraId, given: &Camera)
     let told = given.focal_source.is_told_by_photographs();
     let fits = |id: &CameraId| {
         let camera = &model.cameras[id];
-        let same_size = (camera.width, camera.height) == (given.width, given.height);
-        *id == group || (told && same_size && camera.focal_source.is_told_by_photographs())
+        *id == group || (told && camera.has_size_of(given) && camera.focal_source.is_told_by_photographs())
     };
     sharing(model).into_keys().filter(fits).collect()
 }
@@ -147,7 +146,7 @@ pub fn merge_agreeing_cameras(model: &mut Reconstruction, options: &IntrinsicsOp
         let camera = &model.cameras[&id];
         let agrees = |other: &&CameraId| {
             let other = &model.cameras[*other];
-            (other.width, other.height) == (camera.width, camera.height)
+            other.has_size_of(camera)
                 && other.focal_source.is_told_by_photographs()
                 && camera.focal_source.is_told_by_photographs()
                 && (other.mean_focal_px() / camera.mean_focal_px()).ln().abs()

@@ -2,6 +2,7 @@
 
 pub mod descriptor;
 mod mutual;
+pub mod standing;
 pub mod two_view;
 
 pub use mutual::{MatchOptions, RatioTest, match_mutual, match_mutual_packed, mutual_matches};

@@ -147,7 +147,7 @@ pub fn run(
         if is_flat {
             notes.push(
                 "All photographs match others, but as if the camera had only been turned: no two show depth. Where an object \
-                 was turned in front of a still background, mask the background (masks/<name>.png, 0 where a picture is to \
+                 of little texture was turned in front of a still background, mask the background (masks/<name>.png, 0 where a picture is to \
                  be left out)."
                     .to_owned(),
             );
@@ -156,6 +156,7 @@ pub fn run(
         notes.push(fell_short);
     }
     let (models, account) = best.unwrap_or_default();
+    notes.extend(background_note(&before));
     notes.extend(look_alike_note(&account, intake));
     let mut state = PipelineState {
         models: models
@@ -168,6 +169,17 @@ pub fn run(
     };
     state.record(key(Stage::CoarseModel));
     Ok(Coarse { state, match_counts: before.match_counts, cameras: before.cameras, cut: account.cut })
+}
+
+/// What was left out because it stands still in the frame, if anything was.
+fn background_note(matches: &CoarseMatches) -> Option<String> {
+    let count = matches.before_background.len();
+    (count > 0).then(|| {
+        format!(
+            "In {count} photographs something stands still in the frame while the rest has moved, such as the background of a \
+             turntable or a stamp. It was left out."
+        )
+    })
 }
 
 /// Pairs a note names; the report lists them all.

@@ -18,6 +18,7 @@ use crate::coarse::MatchGraph;
 use crate::coarse::hybrid_match::{CoarseDescriptors, match_hybrid};
 use crate::coarse::pair_selection::{GeoPosition, PairingImage, select_pairs};
 use crate::coarse::selection::SelectionOptions;
+use crate::matching::standing;
 use crate::matching::two_view::{self, TwoViewGeometry};
 use crate::math::Rng;
 use crate::scene::{CameraId, Features, ImageId, KeypointIdx};
@@ -31,6 +32,8 @@ pub(super) struct CoarseMatches {
     pub(super) match_counts: MatchCounts,
     /// Intrinsics as far as the pairs tell them.
     pub(super) cameras: BTreeMap<CameraId, Camera>,
+    /// Images that stand before a background of their own: some matches stand still in the frame while others have a geometry.
+    pub(super) before_background: BTreeSet<ImageId>,
     /// What the report should say.
     pub(super) notes: Vec<String>,
 }
@@ -58,8 +61,30 @@ pub(super) struct Matcher<'a> {
     pub(super) context: &'a Context,
 }
 
-/// Number of matches of a pair, and what its verification found.
-type Matched = (Pair, (u32, Option<TwoViewGeometry>));
+/// What matching and verification of a pair found.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Found {
+    /// Number of matches.
+    num_matches: u32,
+    /// What its verification found.
+    geometry: Option<TwoViewGeometry>,
+    /// What stands still in the frame.
+    standing: Standing,
+}
+
+/// Which of a pair's matches stand still in the frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+enum Standing {
+    /// None to speak of.
+    None,
+    /// Some, which were left out: the others have a geometry of their own.
+    LeftOut,
+    /// All that agree with each other.
+    All,
+}
+
+/// A pair and what was found.
+type Matched = (Pair, Found);
 
 /// The selected features of an image. Only those of a tile of pairs are in memory at a time.
 struct Selected {
@@ -95,9 +120,9 @@ impl Matcher<'_> {
         };
         let work = |(a, b): Pair, (in_a, in_b): (&Selected, &Selected)| {
             let matches = match_hybrid(&in_a.descriptors, &in_b.descriptors, &self.options.matching).matches;
-            let geometry = self.verify((a, b), (in_a, in_b), &matches, &self.intake.cameras);
+            let found = self.verify_moved((a, b), (in_a, in_b), &matches);
             more(1);
-            (matches.len() as u32, geometry)
+            found
         };
         let matched = self.for_pairs(&pairs, known, work, |unit, results| self.units.keep(&unit, results))?;
         self.context.check_cancelled()?;
@@ -105,13 +130,19 @@ impl Matcher<'_> {
         let mut result = CoarseMatches {
             graph: before.graph.clone(),
             match_counts: before.match_counts.clone(),
+            before_background: before.before_background.clone(),
             ..Default::default()
         };
+        let left_out = matched.iter().filter(|(_, found)| found.standing == Standing::LeftOut);
+        result.before_background.extend(left_out.flat_map(|&((a, b), _)| [a, b]));
         let (mut tentative, mut verified) = (0, 0);
-        for (pair, (count, geometry)) in matched {
-            tentative += usize::from(count > 0);
-            result.match_counts.insert(pair, count);
-            if let Some(geometry) = geometry {
+        for (pair, found) in matched {
+            tentative += usize::from(found.num_matches > 0);
+            result.match_counts.insert(pair, found.num_matches);
+            let Some(geometry) = found.geometry else { continue };
+            // Of pictures of one spot all matches stand still, too; but none of theirs with others.
+            let by_background = [pair.0, pair.1].iter().any(|id| result.before_background.contains(id));
+            if !(found.standing == Standing::All && by_background) {
                 verified += 1;
                 result.graph.pairs.insert(pair, geometry);
             }
@@ -228,6 +259,41 @@ impl Matcher<'_> {
             results.extend(of_unit);
         }
         Ok(results)
+    }
+
+    /// Verifies a pair by the matches that moved, if others stand still and these have a geometry of their own; else by all.
+    fn verify_moved(
+        &self,
+        pair: Pair,
+        images: (&Selected, &Selected),
+        matches: &[(KeypointIdx, KeypointIdx)],
+    ) -> Found {
+        let num_matches = matches.len() as u32;
+        let verify = |matches: &[_]| self.verify(pair, images, matches, &self.intake.cameras);
+        let Some(moved) = self.moved(images, matches) else {
+            return Found { num_matches, geometry: verify(matches), standing: Standing::None };
+        };
+        match verify(&moved) {
+            Some(geometry) => Found { num_matches, geometry: Some(geometry), standing: Standing::LeftOut },
+            None => Found { num_matches, geometry: verify(matches), standing: Standing::All },
+        }
+    }
+
+    /// The matches that moved; none where none to speak of stand still, or where the pictures differ in size.
+    fn moved(
+        &self,
+        (in_a, in_b): (&Selected, &Selected),
+        matches: &[(KeypointIdx, KeypointIdx)],
+    ) -> Option<Vec<(KeypointIdx, KeypointIdx)>> {
+        let camera = |image: &Selected| &self.intake.cameras[&image.camera];
+        if !camera(in_a).has_size_of(camera(in_b)) {
+            return None;
+        }
+        let shift_px =
+            |&(a, b): &(KeypointIdx, KeypointIdx)| (in_b.pixels[b.index()].0 - in_a.pixels[a.index()].0).norm();
+        let shifts_px: Vec<f64> = matches.iter().map(shift_px).collect();
+        let moved = standing::moved(&shifts_px, &self.options.standing)?;
+        Some(matches.iter().zip(moved).filter_map(|(&pair, moved)| moved.then_some(pair)).collect())
     }
 
     fn verify(

@@ -17,6 +17,7 @@ use crate::coarse::pair_selection::PairSelectionOptions;
 use crate::coarse::selection::SelectionOptions;
 use crate::features::SiftOptions;
 use crate::formats::photograph::PhotographLimits;
+use crate::matching::standing::StandingOptions;
 use crate::matching::two_view::TwoViewOptions;
 use crate::math::RobustLoss;
 
@@ -117,6 +118,8 @@ pub struct CoarseOptions {
     pub pairs: PairSelectionOptions,
     /// How a pair is matched.
     pub matching: HybridMatchOptions,
+    /// Which matches are no part of the scene, as they stand still in the frame.
+    pub standing: StandingOptions,
     /// How a pair is verified.
     pub two_view: TwoViewOptions,
     /// When votes of pairs settle a focal length.
@@ -136,6 +139,7 @@ impl Default for CoarseOptions {
             selection: SelectionOptions::default(),
             pairs: PairSelectionOptions::default(),
             matching: HybridMatchOptions::default(),
+            standing: StandingOptions::default(),
             two_view: TwoViewOptions::default(),
             focals: FocalOptions::default(),
             look_alikes: LookAlikeOptions::default(),
@@ -202,6 +206,7 @@ impl ReconstructionOptions {
         self.coarse.selection.validate(&mut errors);
         self.coarse.pairs.validate(&mut errors);
         self.coarse.matching.validate(&mut errors);
+        self.coarse.standing.validate(&mut errors);
         self.coarse.two_view.validate(&mut errors);
         self.coarse.focals.validate(&mut errors);
         self.coarse.look_alikes.validate(&mut errors);

@@ -1,4 +1,5 @@
-//! Sets that leave a two-view geometry undetermined: views turned on the spot, and a flat scene.
+//! Sets that leave a two-view geometry undetermined or mislead it: views turned on the spot, a flat scene, and a background that
+//! stands still in the frame.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -18,6 +19,9 @@ const SIZE_PX: [u32; 2] = [640, 480];
 const NUM_PHOTOGRAPHS: usize = 9;
 /// The rendered photographs' focal length.
 const FOCAL_PX: f64 = 0.86 * 640.0;
+/// Photographs of the object on the turntable, and what of the frame's size it fills.
+const NUM_TURNED: usize = 10;
+const OBJECT_RADIUS: f64 = 0.38;
 
 fn calibration(focal_px: f64) -> Matrix3<f64> {
     let [width, height] = SIZE_PX.map(f64::from);
@@ -144,13 +148,53 @@ fn a_flat_scene_is_reconstructed() {
     }
     let found = centers(&images, &folder.path().join("out"));
     assert_eq!(found.len(), truth.len());
-    // Distances between cameras, up to one scale, do not ask for an alignment.
+    let worst = worst_distance_error(&found, &truth);
+    assert!(worst < 0.03, "a distance of cameras 2.2 from the wall is {worst} off");
+}
+
+/// The largest error of a distance between two cameras. Distances, up to one scale, do not ask for an alignment.
+fn worst_distance_error(found: &BTreeMap<String, Vector3<f64>>, truth: &BTreeMap<String, Vector3<f64>>) -> f64 {
     let distances = |of: &BTreeMap<String, Vector3<f64>>| -> Vec<f64> {
         let all: Vec<Vector3<f64>> = of.values().copied().collect();
         all.iter().enumerate().flat_map(|(k, a)| all[..k].iter().map(move |b| (a - b).norm())).collect()
     };
-    let (found, truth) = (distances(&found), distances(&truth));
+    let (found, truth) = (distances(found), distances(truth));
     let scale = truth.iter().sum::<f64>() / found.iter().sum::<f64>();
-    let worst = found.iter().zip(&truth).map(|(a, b)| (scale * a - b).abs()).fold(0.0, f64::max);
-    assert!(worst < 0.03, "a distance of cameras 2.2 from the wall is {worst} off");
+    found.iter().zip(&truth).map(|(a, b)| (scale * a - b).abs()).fold(0.0, f64::max)
+}
+
+/// As on a turntable before a camera on a tripod: the middle of each picture shows the object from another side, and the same room
+/// is around it in all, with more matches than the object has.
+#[test]
+fn a_background_that_stands_still_is_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let images = folder.path().join("images");
+    std::fs::create_dir(&images).unwrap();
+    let room = image::imageops::rotate180(&image::open(photographs().join("temple_003.jpg")).unwrap().to_rgb8());
+    let mut rng = Rng::from_parts(&[4]);
+    for at in 0..NUM_TURNED {
+        let object = image::open(photographs().join(format!("temple_{at:03}.jpg"))).unwrap().to_rgb8();
+        let turned = RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], |x, y| {
+            let [right, down] =
+                [(x, SIZE_PX[0]), (y, SIZE_PX[1])].map(|(at, size)| f64::from(at) / f64::from(size) - 0.5);
+            let Rgb(pixel) = *if right.hypot(down) < OBJECT_RADIUS { &object } else { &room }.get_pixel(x, y);
+            let noise = rng.range(-2.0, 2.0);
+            Rgb(pixel.map(|value| (f64::from(value) + noise).clamp(0.0, 255.0) as u8))
+        });
+        turned.save(images.join(format!("temple_{at:03}.png"))).unwrap();
+    }
+    let found = centers(&images, &folder.path().join("out"));
+    assert_eq!(found.len(), NUM_TURNED, "{:?}", found.keys());
+    let report: serde_json::Value =
+        serde_json::from_reader(File::open(folder.path().join("out/report.json")).unwrap()).unwrap();
+    let notes = report["notes"].to_string();
+    assert!(notes.contains(&format!("In {NUM_TURNED} photographs something stands still")), "{notes}");
+    let truth = centers(&photographs(), &folder.path().join("undisturbed"));
+    let truth: BTreeMap<_, _> = truth
+        .into_iter()
+        .map(|(name, center)| (name.replace("jpg", "png"), center))
+        .filter(|(name, _)| found.contains_key(name))
+        .collect();
+    let off = worst_distance_error(&found, &truth) / extent(truth.values().copied());
+    assert!(off < 0.02, "a distance is {off} of the set's extent off");
 }
