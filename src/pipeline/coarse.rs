@@ -147,8 +147,8 @@ pub fn run(
         if is_flat {
             notes.push(
                 "All photographs match others, but as if the camera had only been turned: no two show depth. Where an object \
-                 of little texture was turned in front of a still background, mask the background (masks/<name>.png, 0 where a picture is to \
-                 be left out)."
+                 of little texture was turned in front of a still background, mask the background (masks/<name>.png, 0 \
+                 where a picture is to be left out)."
                     .to_owned(),
             );
             break;
