@@ -144,10 +144,9 @@ fn leave_out_standing(
             (&first.features.keypoints[found.query as usize], &second.features.keypoints[found.target as usize]);
         f64::from(b.x - a.x).hypot(f64::from(b.y - a.y))
     };
-    let shifts_px: Vec<f64> = matches.iter().map(shift_px).collect();
-    let Some(moved) = standing::moved(&shifts_px, &options.standing) else { return };
-    let mut moved = moved.into_iter();
-    matches.retain(|_| moved.next().unwrap_or(true));
+    if let Some(moved) = standing::moved(matches, shift_px, &options.standing) {
+        *matches = moved;
+    }
 }
 
 /// Bins of the histogram of orientation changes: 10 degrees each.

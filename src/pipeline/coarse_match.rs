@@ -291,9 +291,7 @@ impl Matcher<'_> {
         }
         let shift_px =
             |&(a, b): &(KeypointIdx, KeypointIdx)| (in_b.pixels[b.index()].0 - in_a.pixels[a.index()].0).norm();
-        let shifts_px: Vec<f64> = matches.iter().map(shift_px).collect();
-        let moved = standing::moved(&shifts_px, &self.options.standing)?;
-        Some(matches.iter().zip(moved).filter_map(|(&pair, moved)| moved.then_some(pair)).collect())
+        standing::moved(matches, shift_px, &self.options.standing)
     }
 
     fn verify(

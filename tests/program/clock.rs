@@ -13,6 +13,7 @@ use reqwest::Client;
 use serde_json::{Value, json};
 
 use crate::program::Program;
+use crate::service::noise;
 
 const DAY_S: i64 = 24 * 3600;
 
@@ -25,16 +26,6 @@ fn start(data_dir: &Path, library: &Path, clock: &Path) -> Program {
 
 fn set(clock: &Path, offset_s: i64) {
     File::options().write(true).open(clock).unwrap().write_all_at(&offset_s.to_ne_bytes(), 0).unwrap();
-}
-
-fn photograph(seed: u32) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    let image = image::RgbImage::from_fn(1200, 900, |x, y| {
-        let noise = (x / 3).wrapping_mul(2_654_435_761) ^ (y / 3).wrapping_mul(40_503).wrapping_add(seed * 77);
-        image::Rgb([(noise >> 9) as u8, (noise >> 13) as u8, (noise >> 17) as u8])
-    });
-    image.write_to(&mut std::io::Cursor::new(&mut bytes), image::ImageFormat::Jpeg).unwrap();
-    bytes
 }
 
 /// No number is negative, and times are in their order.
@@ -106,7 +97,7 @@ async fn setting_the_clock_expires_nothing_and_turns_no_duration_negative() {
     let dataset = made.json::<Value>().await.unwrap()["id"].as_str().unwrap().to_owned();
     let mut form = reqwest::multipart::Form::new();
     for seed in 0..4 {
-        let part = reqwest::multipart::Part::bytes(photograph(seed)).file_name(format!("{seed}.jpg"));
+        let part = reqwest::multipart::Part::bytes(noise([1200, 900], seed)).file_name(format!("{seed}.jpg"));
         form = form.part("images", part);
     }
     let images = format!("{base}/api/v1/datasets/{dataset}/images");

@@ -27,6 +27,15 @@ fn crash_image(service: &Service) -> tempfile::TempDir {
     image
 }
 
+/// The service started on such an image, once this statement has changed its database.
+async fn started_after(image: tempfile::TempDir, change: &'static str) -> Service {
+    let url = format!("sqlite://{}", image.path().join("multistage.db").display());
+    let pool = sqlx::SqlitePool::connect(&url).await.unwrap();
+    sqlx::query(change).execute(&pool).await.unwrap();
+    pool.close().await;
+    Service::start_in(image, |_| {}).await
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_job_that_ran_goes_on_from_its_last_finished_stage() {
     let service = Service::start().await;
@@ -47,11 +56,7 @@ async fn a_cancel_that_was_acknowledged_holds_after_a_crash() {
     service.wait_hanging(&job).await;
     let image = crash_image(&service);
     // The crash came between the answer to the cancel and the end of the run.
-    let pool =
-        sqlx::SqlitePool::connect(&format!("sqlite://{}", image.path().join("multistage.db").display())).await.unwrap();
-    sqlx::query("UPDATE jobs SET cancel_requested = 1").execute(&pool).await.unwrap();
-    pool.close().await;
-    let after = Service::start_in(image, |_| {}).await;
+    let after = started_after(image, "UPDATE jobs SET cancel_requested = 1").await;
     let cancelled = after.get(job["links"]["self"].as_str().unwrap()).await.ok(200);
     assert_eq!((&cancelled["state"], &cancelled["cancel_requested"]), (&json!("cancelled"), &json!(false)));
 }
@@ -62,11 +67,7 @@ async fn a_job_that_kills_the_process_again_and_again_is_given_up() {
     let job = service.job("hang").await;
     service.wait_hanging(&job).await;
     let image = crash_image(&service);
-    let pool =
-        sqlx::SqlitePool::connect(&format!("sqlite://{}", image.path().join("multistage.db").display())).await.unwrap();
-    sqlx::query("UPDATE jobs SET interruptions = 9, stages_finished = 1").execute(&pool).await.unwrap();
-    pool.close().await;
-    let after = Service::start_in(image, |_| {}).await;
+    let after = started_after(image, "UPDATE jobs SET interruptions = 9, stages_finished = 1").await;
     let failed = after.get(job["links"]["self"].as_str().unwrap()).await.ok(200);
     assert_eq!((&failed["error"]["code"], &failed["error"]["stage"]), (&json!("interrupted"), &json!("coarse_match")));
     // Somebody may still want to try.

@@ -6,19 +6,10 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 
 use crate::program::Program;
+use crate::service::noise;
 
 /// More lives than a job may take.
 const TOO_MANY: usize = 15;
-
-fn photograph(seed: u32) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    let image = image::RgbImage::from_fn(2400, 1800, |x, y| {
-        let noise = (x / 3).wrapping_mul(2_654_435_761) ^ (y / 3).wrapping_mul(40_503).wrapping_add(seed * 77);
-        image::Rgb([(noise >> 9) as u8, (noise >> 13) as u8, (noise >> 17) as u8])
-    });
-    image.write_to(&mut std::io::Cursor::new(&mut bytes), image::ImageFormat::Jpeg).unwrap();
-    bytes
-}
 
 async fn get(base: &str, path: &str) -> Value {
     reqwest::get(format!("{base}{path}")).await.unwrap().json().await.unwrap()
@@ -30,7 +21,7 @@ async fn dataset(base: &str, photographs: u32) -> String {
     let dataset = made.json::<Value>().await.unwrap()["id"].as_str().unwrap().to_owned();
     let mut form = reqwest::multipart::Form::new();
     for seed in 0..photographs {
-        let part = reqwest::multipart::Part::bytes(photograph(seed)).file_name(format!("{seed}.jpg"));
+        let part = reqwest::multipart::Part::bytes(noise([2400, 1800], seed)).file_name(format!("{seed}.jpg"));
         form = form.part("images", part);
     }
     let images = format!("{base}/api/v1/datasets/{dataset}/images");

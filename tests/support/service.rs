@@ -343,6 +343,17 @@ pub fn file(name: &str, bytes: &[u8]) -> Part {
     Part::bytes(bytes.to_vec()).file_name(name.to_owned())
 }
 
+/// A photograph of this width and height that shows noise, so features everywhere; by its seed another.
+pub fn noise([width, height]: [u32; 2], seed: u32) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let image = image::RgbImage::from_fn(width, height, |x, y| {
+        let noise = (x / 3).wrapping_mul(2_654_435_761) ^ (y / 3).wrapping_mul(40_503).wrapping_add(seed * 77);
+        image::Rgb([(noise >> 9) as u8, (noise >> 13) as u8, (noise >> 17) as u8])
+    });
+    image.write_to(&mut std::io::Cursor::new(&mut bytes), image::ImageFormat::Jpeg).unwrap();
+    bytes
+}
+
 /// A small JPEG, twice as wide as high, with this orientation tag.
 pub fn jpeg(width: u32, height: u32) -> Vec<u8> {
     let mut bytes = Vec::new();

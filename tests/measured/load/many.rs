@@ -13,7 +13,6 @@ use serde_json::{Value, json};
 use tokio::task::JoinHandle;
 
 use super::{content, dataset, expect, memory_bytes, number, upload_body};
-
 use crate::program::Program;
 
 /// Connections that bring them.
