@@ -173,7 +173,7 @@ async fn broken(base: &str, data_dir: &Path, promise: &Promise) -> Option<String
 struct Recorded {
     root: PathBuf,
     lines: Vec<Line>,
-    /// The line that sent the answer to a request.
+    /// The line that began to send the answer to a request.
     sent: BTreeMap<String, usize>,
     promises: Promises,
 }
@@ -199,11 +199,11 @@ async fn record() -> Option<Recorded> {
     program.wait_for_end();
     let lines = parse(&String::from_utf8_lossy(&std::fs::read(record).unwrap()));
     let mut sent = BTreeMap::new();
-    for (at, line) in lines.iter().enumerate().filter(|(_, line)| line.is_sent()) {
+    for (at, line) in lines.iter().enumerate().filter(|(_, line)| line.begins_to_send()) {
         let bytes = line.bytes();
         let text = String::from_utf8_lossy(&bytes);
         for id in text.split("x-request-id: ").skip(1).filter_map(|rest| rest.get(..36)) {
-            sent.insert(id.to_owned(), at);
+            sent.entry(id.to_owned()).or_insert(at);
         }
     }
     Some(Recorded { root, lines, sent, promises })

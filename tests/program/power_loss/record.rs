@@ -19,6 +19,8 @@ pub struct Line {
     arguments: Vec<String>,
     /// What it gave; none where it has only begun.
     result: Option<i64>,
+    /// Whether an earlier line told of its begin.
+    is_end: bool,
 }
 
 impl Line {
@@ -27,9 +29,9 @@ impl Line {
         self.arguments.iter().flat_map(|argument| text(argument)).collect()
     }
 
-    /// Whether it sends bytes, maybe to a client.
-    pub fn is_sent(&self) -> bool {
-        self.result.is_some_and(|sent| sent > 0) && matches!(&*self.call, "write" | "writev" | "sendto" | "sendmsg")
+    /// Whether it begins to send bytes, maybe to a client, who may have them before the call is over.
+    pub fn begins_to_send(&self) -> bool {
+        !self.is_end && matches!(&*self.call, "write" | "writev" | "sendto" | "sendmsg")
     }
 }
 
@@ -46,6 +48,7 @@ pub fn parse(record: &str) -> Vec<Line> {
     for line in record.lines() {
         let Some((process, rest)) = line.split_once(char::is_whitespace) else { continue };
         let (process, rest) = (process.to_owned(), rest.trim_start());
+        let is_end = rest.starts_with("<... ");
         let whole = if let Some(start) = rest.strip_suffix("<unfinished ...>") {
             begun.insert(process.clone(), start.to_owned());
             format!("{}) = ?", start.trim_end().trim_end_matches(','))
@@ -62,7 +65,7 @@ pub fn parse(record: &str) -> Vec<Line> {
         };
         let result = result.split(' ').next().unwrap().parse().ok();
         let arguments = arguments.split(", ").map(|argument| argument.trim().to_owned()).collect();
-        lines.push(Line { process, call: call.to_owned(), arguments, result });
+        lines.push(Line { process, call: call.to_owned(), arguments, result, is_end });
     }
     lines
 }
@@ -174,6 +177,15 @@ impl Disk {
     pub fn take(&mut self, line: &Line) {
         let arguments: Vec<&str> = line.arguments.iter().map(String::as_str).collect();
         let is_sync = matches!(&*line.call, "fsync" | "fdatasync");
+        if line.call == "close" {
+            // Its number is free from the begin, and another thread may have it again before the end is recorded.
+            if !line.is_end
+                && let Ok(file) = arguments[0].parse()
+            {
+                self.open.remove(&file);
+            }
+            return;
+        }
         let Some(result) = line.result else {
             if is_sync {
                 self.syncing.insert(line.process.clone(), self.changes);
@@ -199,7 +211,6 @@ impl Disk {
                 let position = if arguments[2].contains("O_APPEND") { self.nodes[node].length } else { 0 };
                 self.open.insert(result, (node, position));
             }
-            ("close", Some((file, _))) => drop(self.open.remove(&file)),
             ("lseek", Some((file, (node, _)))) => drop(self.open.insert(file, (node, result as u64))),
             ("write" | "writev", Some((file, (node, position)))) => {
                 let bytes = line.bytes()[..result as usize].to_vec();
