@@ -43,6 +43,16 @@ pub enum LocalizeFailure {
         /// The method that found them.
         method: LocalizationMethod,
     },
+    /// The pose is turned another way than the pairs with the image say.
+    #[error(
+        "a pose that {inliers} matches with points of the model agree on is turned another way than pairs of photographs say"
+    )]
+    TurnedOtherwise {
+        /// Correspondences that agree with the pose.
+        inliers: usize,
+        /// Correspondences found.
+        correspondences: usize,
+    },
 }
 
 impl LocalizeFailure {
@@ -51,7 +61,8 @@ impl LocalizeFailure {
         match *self {
             Self::NoFeatures | Self::EmptyModel => (0, 0),
             Self::TooFewCorrespondences { found, .. } => (0, found),
-            Self::TooFewInliers { inliers, correspondences, .. } => (1 + inliers, correspondences),
+            Self::TooFewInliers { inliers, correspondences, .. }
+            | Self::TurnedOtherwise { inliers, correspondences } => (1 + inliers, correspondences),
         }
     }
 }

@@ -8,6 +8,7 @@ pub mod look_alikes;
 mod mapper;
 mod match_graph;
 pub mod pair_selection;
+pub mod rotation_cycles;
 pub mod selection;
 mod tracks;
 

@@ -14,7 +14,7 @@
 mod options;
 mod pose;
 
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{Camera, FocalSource, Pixel};
@@ -298,6 +298,16 @@ pub fn verify(
 }
 
 impl TwoViewGeometry {
+    /// How camera b is turned against camera a: by the relative pose or, of a panoramic pair, by its homography `K_b R K_a^-1`.
+    pub fn rotation(&self, camera_a: &Camera, camera_b: &Camera) -> Option<UnitQuaternion<f64>> {
+        if let Some(b_from_a) = &self.b_from_a {
+            return Some(b_from_a.rotation);
+        }
+        let homography = self.homography.filter(|_| self.config == TwoViewConfig::Panoramic)?;
+        let scaled = camera_b.calibration_matrix().try_inverse()? * homography * camera_a.calibration_matrix();
+        Some(UnitQuaternion::from_matrix(&(scaled * scaled.determinant().signum())))
+    }
+
     /// The relative pose under cameras that may have changed since the pair was verified (a focal length found later): from
     /// the fundamental matrix, made essential and refined on the inliers. None for pairs without epipolar geometry.
     pub fn relative_pose(

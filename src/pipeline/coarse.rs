@@ -16,6 +16,7 @@ use super::{PipelineError, Stage, StageKey};
 use crate::add_cameras::MatchCounts;
 use crate::camera::{Camera, Pixel};
 use crate::coarse::look_alikes::{self, CutPair, LookAlikeAccount};
+use crate::coarse::rotation_cycles::RotationForest;
 use crate::coarse::selection::SelectionOptions;
 use crate::coarse::{CoarseModels, MapperImage, MapperInput, MapperRun, MatchGraph};
 use crate::scene::{ApartImages, CameraId, ImageId};
@@ -29,6 +30,8 @@ pub struct Coarse {
     pub state: PipelineState,
     /// Coarse matches of every pair.
     pub match_counts: PairMatchCounts,
+    /// How the pairs that were not cut say that images are turned.
+    pub rotations: RotationForest,
     /// Intrinsics as far as the pairs tell them.
     pub cameras: BTreeMap<CameraId, Camera>,
     /// Pairs that were cut as look-alikes.
@@ -168,7 +171,13 @@ pub fn run(
         most_alike: most_alike(&before.graph),
     };
     state.record(key(Stage::CoarseModel));
-    Ok(Coarse { state, match_counts: before.match_counts, cameras: before.cameras, cut: account.cut })
+    for cut in &account.cut {
+        before.graph.pairs.remove(&cut.images);
+    }
+    let camera_of: BTreeMap<ImageId, CameraId> =
+        intake.photographs().map(|(id, _, photograph)| (id, photograph.camera)).collect();
+    let rotations = RotationForest::of(&before.graph, |id| &before.cameras[&camera_of[&id]]);
+    Ok(Coarse { state, match_counts: before.match_counts, rotations, cameras: before.cameras, cut: account.cut })
 }
 
 /// What was left out because it stands still in the frame, if anything was.

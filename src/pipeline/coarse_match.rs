@@ -17,6 +17,7 @@ use crate::camera::{Camera, FocalSource, Pixel};
 use crate::coarse::MatchGraph;
 use crate::coarse::hybrid_match::{CoarseDescriptors, match_hybrid};
 use crate::coarse::pair_selection::{GeoPosition, PairingImage, select_pairs};
+use crate::coarse::rotation_cycles;
 use crate::coarse::selection::SelectionOptions;
 use crate::matching::standing;
 use crate::matching::two_view::{self, TwoViewGeometry};
@@ -156,6 +157,12 @@ impl Matcher<'_> {
         };
         self.reverify(&mut result)?;
         self.context.check_cancelled()?;
+        let contradicted = {
+            let camera_of = self.camera_of_image();
+            let camera = |id: ImageId| &result.cameras[&camera_of[&id]];
+            rotation_cycles::contradicted(&result.graph, camera, &self.options.mapper.rotation_cycles)
+        };
+        result.graph.pairs.retain(|pair, _| !contradicted.contains(pair));
         let inliers = result.graph.pairs.values().map(|geometry| geometry.inliers.len()).sum();
         let selected = self.usable().map(|(_, _, count)| self.selection.num_selected(count)).sum();
         let totals = counts([
@@ -163,6 +170,7 @@ impl Matcher<'_> {
             ("pairs_reused", reused),
             ("pairs_matched", tentative),
             ("pairs_verified", verified),
+            ("pairs_contradicted", contradicted.len()),
             ("features_selected", selected),
             ("inlier_matches", inliers),
         ]);

@@ -17,6 +17,7 @@ use super::{Context, PipelineError, Stage};
 use crate::add_cameras::{LocalizeFailure, ModelSnapshot, Outcome, QueryImage, add_localized, localize_all};
 use crate::camera::Camera;
 use crate::coarse::Unregistered;
+use crate::coarse::rotation_cycles::RotationForest;
 use crate::scene::{CameraId, Features, ImageId, Reconstruction};
 
 /// Images of a unit of work: a stop costs what a few images take, and storing a unit little next to that.
@@ -32,6 +33,8 @@ pub struct Localiser<'a> {
     pub cameras: &'a BTreeMap<CameraId, Camera>,
     /// Coarse matches of every pair.
     pub match_counts: &'a PairMatchCounts,
+    /// How the pairs say that images are turned.
+    pub rotations: &'a RotationForest,
     /// The features.
     pub cache: &'a FeatureCache<'a>,
     /// Where finished units are kept.
@@ -65,7 +68,8 @@ impl Localiser<'_> {
             let snapshot = ModelSnapshot::build(model, &load, options);
             let (found, known) = self.localize(rank, model, &snapshot, &queries, progress)?;
             reused += known;
-            let account = add_localized(model, &snapshot, found, &load, options, seed);
+            let held = self.held_against_pairs(model, found);
+            let account = add_localized(model, &snapshot, held, &load, options, seed);
             self.cache.check(Stage::AddCameras)?;
             added += account.added.len();
             sightings += account.observations_added;
@@ -124,6 +128,27 @@ impl Localiser<'_> {
         Ok((found, reused))
     }
 
+    /// What was found, without the poses that are turned another way than pairs with the image say.
+    fn held_against_pairs(
+        &self,
+        model: &Reconstruction,
+        found: BTreeMap<ImageId, Outcome>,
+    ) -> BTreeMap<ImageId, Outcome> {
+        let options = &self.options.coarse.mapper.rotation_cycles;
+        let held = found.into_iter().map(|(id, outcome)| {
+            let checked = outcome.and_then(|localized| {
+                let (pose, inliers) = (&localized.cam_from_world, localized.inliers.len());
+                if self.rotations.contradicts_pose(model, id, pose, inliers, options) {
+                    let correspondences = localized.num_correspondences;
+                    return Err(LocalizeFailure::TurnedOtherwise { inliers, correspondences });
+                }
+                Ok(localized)
+            });
+            (id, checked)
+        });
+        held.collect()
+    }
+
     /// The photographs that have features and no pose.
     fn queries(&self, state: &PipelineState) -> Vec<QueryImage> {
         let located = state.located();
@@ -153,6 +178,9 @@ fn reason(failure: &LocalizeFailure) -> Option<Unregistered> {
         LocalizeFailure::TooFewInliers { inliers, correspondences: visible, .. } => {
             Some(Unregistered::PoseFailed { visible, inliers })
         }
+        LocalizeFailure::TurnedOtherwise { inliers, correspondences: visible } => {
+            Some(Unregistered::TurnedOtherwise { visible, inliers })
+        }
     }
 }
 
@@ -161,7 +189,7 @@ fn reason(failure: &LocalizeFailure) -> Option<Unregistered> {
 fn progress_of(why: &Unregistered) -> usize {
     match *why {
         Unregistered::TooFewPoints { .. } => 0,
-        Unregistered::NoPairs | Unregistered::NoInitialPair => 1,
-        Unregistered::PoseFailed { inliers, .. } => 1 + inliers,
+        Unregistered::NoPairs | Unregistered::TooFewTogether { .. } | Unregistered::NoInitialPair => 1,
+        Unregistered::PoseFailed { inliers, .. } | Unregistered::TurnedOtherwise { inliers, .. } => 1 + inliers,
     }
 }

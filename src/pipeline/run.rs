@@ -85,7 +85,7 @@ impl Pipeline<'_> {
         let mut notes = Vec::new();
         let mut models_key = ArtifactKey::of("coarse", &[&input_key.0, &options.coarse]);
         let coarse = coarse::run(&mut runner, &intake, &found, options, &models_key, &mut notes)?;
-        let coarse::Coarse { mut state, match_counts, cameras, cut } = coarse;
+        let coarse::Coarse { mut state, match_counts, rotations, cameras, cut } = coarse;
 
         let mut placed_before: Option<BTreeSet<ImageId>> = None;
         for iteration in 1..=options.iterations {
@@ -101,6 +101,7 @@ impl Pipeline<'_> {
                     found: &found,
                     cameras: &cameras,
                     match_counts: &match_counts,
+                    rotations: &rotations,
                     cache: &cache,
                     units: &units,
                     options,

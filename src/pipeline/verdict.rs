@@ -109,6 +109,17 @@ fn reason(features: usize, why: &Unregistered, most_alike: Option<&str>) -> Reas
                      thirds overlap."
                 .to_owned(),
         },
+        Unregistered::TooFewTogether { images } => Reason {
+            code: "too_few_matching_images",
+            advice: format!(
+                "It matches {} alone, which is too little for a model. Add photographs taken around and between them, with two \
+                 thirds overlap.",
+                match (images, most_alike) {
+                    (2, Some(name)) => name.to_owned(),
+                    _ => format!("{} other photographs", images.saturating_sub(1)),
+                }
+            ),
+        },
         Unregistered::NoInitialPair => Reason {
             code: "no_initial_pair",
             advice: "It matches other photographs, but no two of them were taken far enough apart to measure depth. \
@@ -123,6 +134,13 @@ fn reason(features: usize, why: &Unregistered, most_alike: Option<&str>) -> Reas
                 1 => format!("It sees only one point of the model. {lead_over}"),
                 few => format!("It sees only {few} points of the model. {lead_over}"),
             },
+        },
+        Unregistered::TurnedOtherwise { inliers, .. } => Reason {
+            code: "pose_not_found",
+            advice: format!(
+                "A camera position fits {inliers} points of the model, but the photographs it matches best say that it was turned \
+                 another way: what it shares with the model may be a look-alike or a repeated pattern. {lead_over}"
+            ),
         },
         Unregistered::PoseFailed { visible, inliers } => Reason {
             code: "pose_not_found",
@@ -160,6 +178,10 @@ mod tests {
         assert!(many.contains("more than 11 of them") && many.contains("look-alike"), "{many}");
         assert!(many.ends_with("Add photographs that lead over from the model to it."), "{many}");
         assert!(advice(7000, &Unregistered::TooFewPoints { visible: 1 }, None).starts_with("It sees only one point"));
+        let two = advice(7000, &Unregistered::TooFewTogether { images: 2 }, Some("a/25.jpg"));
+        assert!(two.starts_with("It matches a/25.jpg alone, which is too little for a model."), "{two}");
+        let turned = advice(7000, &Unregistered::TurnedOtherwise { visible: 30, inliers: 18 }, Some("a/25.jpg"));
+        assert!(turned.contains("fits 18 points") && turned.contains("repeated pattern"), "{turned}");
         // Nothing can be said of matches where there is nothing to match.
         let black = reason(0, &Unregistered::NoPairs, None);
         assert_eq!(black.code, "too_few_features");

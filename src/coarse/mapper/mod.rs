@@ -24,6 +24,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use super::rotation_cycles::RotationForest;
 use super::{MatchGraph, Tracks};
 use crate::camera::{Camera, Pixel};
 use crate::scene::{ApartImages, CameraId, ImageId, Point3dId, Reconstruction};
@@ -57,6 +58,11 @@ pub struct MapperInput {
 pub enum Unregistered {
     /// No pair with it was verified.
     NoPairs,
+    /// Its component is too small for a model.
+    TooFewTogether {
+        /// Images of it.
+        images: usize,
+    },
     /// Its component gave no model: no pair of it could start one.
     NoInitialPair,
     /// It sees too few points of the model.
@@ -69,6 +75,13 @@ pub enum Unregistered {
         /// Points it sees.
         visible: usize,
         /// Those the best pose agreed with.
+        inliers: usize,
+    },
+    /// The pose that some of the points it sees agree with is turned another way than the pairs with it say.
+    TurnedOtherwise {
+        /// Points it sees.
+        visible: usize,
+        /// Those that agree with the pose.
         inliers: usize,
     },
 }
@@ -89,6 +102,10 @@ pub fn reconstruct(input: &MapperInput, options: &MapperOptions, run: &MapperRun
         result.unregistered.insert(image, Unregistered::NoPairs);
     }
     for component in input.graph.components() {
+        if component.len() < options.min_model_images {
+            let why = Unregistered::TooFewTogether { images: component.len() };
+            result.unregistered.extend(component.iter().map(|&image| (image, why.clone())));
+        }
         let mut remaining = component;
         while remaining.len() >= options.min_model_images && (run.keep_going)() {
             for &image in &remaining {
@@ -162,6 +179,7 @@ pub(super) struct Mapper<'a> {
     input: &'a MapperInput,
     graph: &'a MatchGraph,
     tracks: &'a Tracks,
+    rotations: RotationForest,
     component: &'a BTreeSet<ImageId>,
     options: &'a MapperOptions,
     run: &'a MapperRun<'a>,
@@ -185,10 +203,12 @@ impl<'a> Mapper<'a> {
         options: &'a MapperOptions,
         run: &'a MapperRun<'a>,
     ) -> Self {
+        let camera = |id: ImageId| &input.cameras[&input.images[&id].camera];
         Self {
             input,
             graph,
             tracks,
+            rotations: RotationForest::of(graph, camera),
             component,
             options,
             run,

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::bundle::BundleOptions;
 use crate::coarse::IntrinsicsOptions;
 use crate::coarse::filter::KeepLimits;
+use crate::coarse::rotation_cycles::RotationCycleOptions;
 use crate::ransac::absolute_pose::AbsolutePoseOptions;
 
 /// Options of the incremental mapper. Pixel thresholds hold for images of `reference_long_side_px` and scale with the image
@@ -55,6 +56,9 @@ pub struct MapperOptions {
     pub global_bundle: BundleOptions,
     /// Which intrinsics are estimated.
     pub intrinsics: IntrinsicsOptions,
+    /// When a pose contradicts the rotations of much stronger pairs and is not taken. Pairs themselves are held against stronger
+    /// ones by the same measure.
+    pub rotation_cycles: RotationCycleOptions,
     /// Share of the points an image should see that it must keep for its pose to count as settled; below, it is placed anew
     /// to find out whether it shares its camera.
     pub settled_share: f64,
@@ -90,6 +94,7 @@ impl Default for MapperOptions {
             local_bundle: BundleOptions::default(),
             global_bundle: BundleOptions::default(),
             intrinsics: IntrinsicsOptions::default(),
+            rotation_cycles: RotationCycleOptions::default(),
             settled_share: 0.6,
             satisfied_share: 0.8,
             max_starts: 3,
@@ -121,6 +126,7 @@ impl MapperOptions {
         check(positive(self.intrinsics.typical_focal), "intrinsics.typical_focal must be positive");
         let sigma_log = self.intrinsics.typical_focal_sigma_log;
         check(sigma_log.is_none_or(positive), "intrinsics.typical_focal_sigma_log must be positive or null");
+        self.rotation_cycles.validate(errors);
     }
 
     /// What sightings and points must keep.

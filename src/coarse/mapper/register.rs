@@ -109,6 +109,17 @@ impl Mapper<'_> {
             self.failures.insert(image, Unregistered::PoseFailed { visible: visible.len(), inliers: 0 });
             return false;
         };
+        let inliers = pose.inliers.iter().filter(|&&inlier| inlier).count();
+        if self.rotations.contradicts_pose(
+            &self.model,
+            image,
+            &pose.cam_from_world,
+            inliers,
+            &self.options.rotation_cycles,
+        ) {
+            self.failures.insert(image, Unregistered::TurnedOtherwise { visible: visible.len(), inliers });
+            return false;
+        }
         let camera = match camera {
             Some(shared) => {
                 if shareable.is_empty() {

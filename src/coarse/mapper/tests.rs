@@ -124,6 +124,59 @@ fn an_image_that_never_holds_is_given_up() {
     assert!(matches!(models.unregistered[&weak], Unregistered::PoseFailed { .. }), "{:?}", models.unregistered);
 }
 
+#[test]
+fn two_images_that_match_each_other_alone_are_too_few() {
+    let options = SceneOptions { num_images: 4, num_points: 500, ..SceneOptions::default() };
+    let mut input = without_exif(&generate(&options), &options, options.focal_px);
+    input.graph.pairs.retain(|&pair, _| pair == (ImageId(0), ImageId(1)));
+    let models = reconstruct(&input, &MapperOptions::default(), &MapperRun::undisturbed(1));
+    assert!(models.models.is_empty());
+    let two = Unregistered::TooFewTogether { images: 2 };
+    let why = [two.clone(), two, Unregistered::NoPairs, Unregistered::NoPairs];
+    assert_eq!(models.unregistered, (0..4).map(ImageId).zip(why).collect());
+}
+
+/// An image with a repeated pattern: it seems to see a few points of the model as another image does, while a strong pair says that
+/// it was turned away from there.
+#[test]
+fn a_pose_that_strong_pairs_contradict_is_not_taken() {
+    let options = SceneOptions { num_images: 16, num_points: 1500, pixel_noise_px: 0.5, ..SceneOptions::default() };
+    let scene = generate(&options);
+    let mut input = without_exif(&scene, &options, options.focal_px);
+    let (first, copied, image) = (ImageId(0), ImageId(8), ImageId(15));
+    input.graph.pairs.retain(|&(_, b), _| b != image);
+    let mut copy = input.images[&copied].clone();
+    for other in (5..8).map(ImageId) {
+        let mut geometry = input.graph.pairs[&(other, copied)].clone();
+        geometry.inliers.truncate(20);
+        input.graph.pairs.insert((other, image), geometry);
+    }
+    // Keypoints of their own for the strong pair.
+    let mut rng = Rng::from_parts(&[3]);
+    let mut further = |keypoints: &mut Arc<[Pixel]>| {
+        let start = keypoints.len() as u32;
+        let more = (0..300).map(|_| Pixel::new(rng.range(0.0, 1000.0), rng.range(0.0, 700.0)));
+        *keypoints = keypoints.iter().copied().chain(more).collect();
+        (start..start + 300).map(crate::scene::KeypointIdx).collect::<Vec<_>>()
+    };
+    let in_first = further(&mut input.images.get_mut(&first).unwrap().keypoints);
+    let in_copy = further(&mut copy.keypoints);
+    input.images.insert(image, copy);
+    let mut strong = input.graph.pairs[&(first, ImageId(1))].clone();
+    strong.inliers = in_first.into_iter().zip(in_copy).collect();
+    strong.b_from_a = Some(crate::geometry::Rigid3::identity());
+    input.graph.pairs.insert((first, image), strong);
+
+    let mut mapper = MapperOptions::default();
+    let models = reconstruct(&input, &mapper, &MapperRun::undisturbed(1));
+    assert_eq!(models.models[0].images().len(), 15);
+    let why = &models.unregistered[&image];
+    assert!(matches!(why, Unregistered::TurnedOtherwise { inliers: 30..=60, .. }), "{why:?}");
+    mapper.rotation_cycles.enabled = false;
+    let taken = reconstruct(&input, &mapper, &MapperRun::undisturbed(1));
+    assert_eq!(taken.models[0].images().len(), 16, "the test can fail");
+}
+
 /// Keeps the bytes of every checkpoint, and says when it is enough.
 #[derive(Default)]
 struct Kept {
