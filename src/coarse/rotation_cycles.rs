@@ -104,6 +104,9 @@ impl RotationForest {
         goal_from_image: impl Fn(ImageId) -> Option<UnitQuaternion<f64>>,
         options: &RotationCycleOptions,
     ) -> bool {
+        if !options.enabled {
+            return false;
+        }
         let is_strong = |link: &&Link| link.inliers as f64 >= options.min_times_stronger * inliers as f64;
         let mut seen = BTreeSet::from([image]);
         let mut waiting = VecDeque::from([(image, UnitQuaternion::identity(), 0)]);
@@ -137,7 +140,7 @@ impl RotationForest {
             let goal_from_world = model.image(goal)?.cam_from_world.rotation;
             Some(goal_from_world * cam_from_world.rotation.inverse())
         };
-        options.enabled && self.contradicts(image, inliers, told, options)
+        self.contradicts(image, inliers, told, options)
     }
 }
 
@@ -147,9 +150,6 @@ pub fn contradicted<'a>(
     camera: impl Fn(ImageId) -> &'a Camera,
     options: &RotationCycleOptions,
 ) -> BTreeSet<(ImageId, ImageId)> {
-    if !options.enabled {
-        return BTreeSet::new();
-    }
     let forest = RotationForest::of(graph, &camera);
     let pairs = graph.pairs.iter().filter(|&(&(a, b), geometry)| {
         geometry.rotation(camera(a), camera(b)).is_some_and(|b_from_a| {

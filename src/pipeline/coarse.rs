@@ -174,8 +174,7 @@ pub fn run(
     for cut in &account.cut {
         before.graph.pairs.remove(&cut.images);
     }
-    let camera_of: BTreeMap<ImageId, CameraId> =
-        intake.photographs().map(|(id, _, photograph)| (id, photograph.camera)).collect();
+    let camera_of = intake.camera_of_image();
     let rotations = RotationForest::of(&before.graph, |id| &before.cameras[&camera_of[&id]]);
     Ok(Coarse { state, match_counts: before.match_counts, rotations, cameras: before.cameras, cut: account.cut })
 }

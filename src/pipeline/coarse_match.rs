@@ -150,7 +150,8 @@ impl Matcher<'_> {
         }
         result.cameras = if before.cameras.is_empty() {
             let mut cameras = self.intake.cameras.clone();
-            result.notes = focals::settle(&result.graph, &mut cameras, &self.camera_of_image(), &self.options.focals);
+            result.notes =
+                focals::settle(&result.graph, &mut cameras, &self.intake.camera_of_image(), &self.options.focals);
             cameras
         } else {
             before.cameras.clone()
@@ -158,7 +159,7 @@ impl Matcher<'_> {
         self.reverify(&mut result)?;
         self.context.check_cancelled()?;
         let contradicted = {
-            let camera_of = self.camera_of_image();
+            let camera_of = self.intake.camera_of_image();
             let camera = |id: ImageId| &result.cameras[&camera_of[&id]];
             rotation_cycles::contradicted(&result.graph, camera, &self.options.mapper.rotation_cycles)
         };
@@ -182,10 +183,6 @@ impl Matcher<'_> {
         self.intake
             .photographs()
             .filter_map(|(id, _, photograph)| Some((id, photograph, *self.found.get(&id)?.count.as_ref().ok()?)))
-    }
-
-    fn camera_of_image(&self) -> BTreeMap<ImageId, CameraId> {
-        self.usable().map(|(id, photograph, _)| (id, photograph.camera)).collect()
     }
 
     /// The pairs to match, by the few features of largest scale that pair selection looks at.
@@ -234,7 +231,7 @@ impl Matcher<'_> {
         work: impl Fn(Pair, (&Selected, &Selected)) -> T + Sync,
         keep: impl Fn(&[Pair], &[(Pair, T)]) -> Result<(), PipelineError>,
     ) -> Result<Vec<(Pair, T)>, PipelineError> {
-        let cameras = self.camera_of_image();
+        let cameras = self.intake.camera_of_image();
         let mut tiles: BTreeMap<(u32, u32), Vec<Pair>> = BTreeMap::new();
         for &(a, b) in pairs {
             tiles.entry((a.0 / TILE_IMAGES, b.0 / TILE_IMAGES)).or_default().push((a, b));
@@ -318,7 +315,7 @@ impl Matcher<'_> {
     /// relative poses. A focal length that is still a guess is taken for the moment: poses from it are rough but can start a
     /// model, which then refines it.
     fn reverify(&self, result: &mut CoarseMatches) -> Result<(), PipelineError> {
-        let camera_of = self.camera_of_image();
+        let camera_of = self.intake.camera_of_image();
         let mut cameras = result.cameras.clone();
         for camera in cameras.values_mut() {
             camera.focal_source = camera.focal_source.max(FocalSource::Estimated);

@@ -71,6 +71,11 @@ impl Intake {
         (0u32..).map(ImageId).zip(&self.files).filter_map(|(id, file)| Some((id, file, file.photograph.as_ref().ok()?)))
     }
 
+    /// The camera of every usable photograph.
+    pub fn camera_of_image(&self) -> BTreeMap<ImageId, CameraId> {
+        self.photographs().map(|(id, _, photograph)| (id, photograph.camera)).collect()
+    }
+
     /// The name of an image.
     pub fn name(&self, id: ImageId) -> &str {
         &self.files[id.index()].name

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 
 use super::{CoarseModels, Mapper, MapperInput, MapperOptions, MapperRun, empty_model, reconstruct};
 use crate::coarse::Tracks;
+use crate::coarse::rotation_cycles::RotationForest;
 use crate::scene::{ImageId, Reconstruction};
 
 /// The models of `input`, given those of the same images from some of its pairs. Where each component of the graph has one model
@@ -27,7 +28,8 @@ pub fn extend(
     for (model, component) in models.models.iter().zip(&placed) {
         let graph = input.graph.restricted_to(component);
         let tracks = Tracks::build(&graph, &input.apart, run.keep_going);
-        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, run);
+        let rotations = RotationForest::of(&graph, |id| input.camera_of(id));
+        let mut mapper = Mapper::new(input, &graph, &tracks, &rotations, component, options, run);
         mapper.adopt(model);
         mapper.grow();
         for (image, reason) in mapper.reasons() {

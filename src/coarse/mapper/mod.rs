@@ -52,6 +52,13 @@ pub struct MapperInput {
     pub apart: ApartImages,
 }
 
+impl MapperInput {
+    /// The intrinsics an image starts from.
+    pub(super) fn camera_of(&self, id: ImageId) -> &Camera {
+        &self.cameras[&self.images[&id].camera]
+    }
+}
+
 /// Why the mapper left an image out.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -145,10 +152,11 @@ fn best_model(
 ) -> Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> {
     let graph = input.graph.restricted_to(component);
     let tracks = Tracks::build(&graph, &input.apart, run.keep_going);
+    let rotations = RotationForest::of(&graph, |id| input.camera_of(id));
     let mut used_starts = BTreeSet::new();
     let mut best: Option<(Reconstruction, BTreeMap<ImageId, Unregistered>)> = None;
     for _ in 0..options.max_starts {
-        let mut mapper = Mapper::new(input, &graph, &tracks, component, options, run);
+        let mut mapper = Mapper::new(input, &graph, &tracks, &rotations, component, options, run);
         if !mapper.start(&mut used_starts) {
             break;
         }
@@ -179,7 +187,7 @@ pub(super) struct Mapper<'a> {
     input: &'a MapperInput,
     graph: &'a MatchGraph,
     tracks: &'a Tracks,
-    rotations: RotationForest,
+    rotations: &'a RotationForest,
     component: &'a BTreeSet<ImageId>,
     options: &'a MapperOptions,
     run: &'a MapperRun<'a>,
@@ -199,16 +207,16 @@ impl<'a> Mapper<'a> {
         input: &'a MapperInput,
         graph: &'a MatchGraph,
         tracks: &'a Tracks,
+        rotations: &'a RotationForest,
         component: &'a BTreeSet<ImageId>,
         options: &'a MapperOptions,
         run: &'a MapperRun<'a>,
     ) -> Self {
-        let camera = |id: ImageId| &input.cameras[&input.images[&id].camera];
         Self {
             input,
             graph,
             tracks,
-            rotations: RotationForest::of(graph, camera),
+            rotations,
             component,
             options,
             run,
