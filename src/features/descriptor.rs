@@ -11,9 +11,8 @@
 
 use std::f32::consts::{SQRT_2, TAU};
 
-use super::gradient::{Every, LANES, Patch};
+use super::gradient_map::{self, Gradient, GradientMap, STEP};
 use super::orientation::clip;
-use super::ring::Ring;
 use super::simd::{Isa, mul_add, stamp, whole_number};
 use crate::scene::{DESCRIPTOR_LEN, Descriptor};
 
@@ -38,9 +37,10 @@ const CLIP: f32 = 0.2;
 /// Quantisation of the square roots.
 const QUANTISATION: f32 = 512.0;
 
-/// From this sigma on, in pixels of its level, every second row and column is looked at: what a Gaussian of this width leaves
-/// of an image turns so slowly that the pixels between tell next to nothing, and a bin is still two or three of those wide.
-const SPARSE_FROM_SIGMA: f32 = 1.4;
+/// Gradients taken together.
+const LANES: usize = 16;
+/// Gradients of the longest row of a patch: across the widest descriptor of the largest sigma.
+const MAX_STRETCH: usize = 512;
 
 /// How far a descriptor at a keypoint of this sigma reaches, in the same pixels.
 pub(super) fn radius_px(sigma: f32) -> f32 {
@@ -59,105 +59,138 @@ const COPIES: usize = 4;
 /// Computes descriptors.
 pub(super) struct Describer {
     copies: [Cells; COPIES],
+    /// The columns' part of the Gaussian weight.
+    window: [f32; MAX_STRETCH],
 }
 
 /// Where a stretch of a row lies in the keypoint's frame.
 pub(super) struct Stretch {
     u: f32,
     v: f32,
+    /// From one gradient to the next.
     du: f32,
     dv: f32,
-    theta: f32,
+    /// The keypoint's orientation in parts of a turn.
+    orientation: u32,
+    /// The row's part of the Gaussian weight.
+    weight: f32,
 }
 
 impl Describer {
     /// A describer; it only keeps buffers.
     pub(super) fn new() -> Self {
-        Self { copies: [[0.0; _]; COPIES] }
+        Self { copies: [[0.0; _]; COPIES], window: [0.0; MAX_STRETCH] }
     }
 
-    /// The descriptor at `(x, y)` (first pixel at 0) of a level.
-    #[allow(clippy::too_many_arguments)]
+    /// The descriptor at `(x, y)` (first pixel at 0) of a level of this width and height.
     pub(super) fn describe(
         &mut self,
         isa: Isa,
-        ring: &Ring,
+        gradients: &GradientMap,
         (width, height): (usize, usize),
         (x, y): (f32, f32),
         sigma: f32,
         theta: f32,
-        patch: &mut Patch,
     ) -> Descriptor {
         self.copies.as_flattened_mut().fill(0.0);
-        let (sin, cos) = theta.sin_cos();
-        let bin = BIN_SIGMAS * sigma;
-        let (du, dv) = (cos / bin, -sin / bin);
-        let radius = REACH * bin * (sin.abs() + cos.abs());
-        let (top, bottom) = clip(y, radius, height);
-        let (from, to) = clip(x, radius, width);
-        let falloff = -1.0 / (FALLOFF * bin * bin);
-        let every = if sigma >= SPARSE_FROM_SIGMA { Every::Second } else { Every::Pixel };
-        let step = every.columns();
-        // The keypoint's own row and column are among them, wherever they lie.
-        let first = top + (y.round() as usize).abs_diff(top) % step;
-        let from = from + (x.round() as usize).abs_diff(from) % step;
-        patch.set_window(x, falloff, from, to, every);
-        for row in (first..bottom).step_by(step) {
-            let dy = row as f32 - y;
-            let (u, v) = (sin * dy / bin, cos * dy / bin);
-            let (low_u, high_u) = inside(u, du);
-            let (low_v, high_v) = inside(v, dv);
-            let (low, high) = (low_u.max(low_v).max(-radius), high_u.min(high_v).min(radius));
-            if low >= high {
-                continue;
-            }
-            let (left, right) = clip(x + 0.5 * (low + high), 0.5 * (high - low), width);
-            let left = from + left.saturating_sub(from).next_multiple_of(step);
-            let right = right.min(to);
-            if left >= right {
-                continue;
-            }
-            let count = patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
-            let (dx, per_column) = (left as f32 - x, step as f32);
-            let (u, v) = (u + du * dx, v + dv * dx);
-            let stretch = Stretch { u, v, du: per_column * du, dv: per_column * dv, theta };
-            accumulate(isa, &stretch, &patch.weight[..count], &patch.direction[..count], &mut self.copies);
-        }
+        add_patch(isa, gradients, (width, height), (x, y), sigma, theta, self);
         quantise(isa, &self.copies)
     }
 }
 
-/// The range of dx with |at + slope dx| < REACH.
-fn inside(at: f32, slope: f32) -> (f32, f32) {
-    let (a, b) = ((-REACH - at) / slope, (REACH - at) / slope);
-    if slope == 0.0 {
-        if at.abs() < REACH { (f32::NEG_INFINITY, f32::INFINITY) } else { (0.0, 0.0) }
-    } else {
-        (a.min(b), a.max(b))
-    }
-}
-
 stamp!(
-    /// Adds a stretch of weighted gradients to the cells.
-    accumulate => accumulate_body(
-        stretch: &Stretch, weight: &[f32], direction: &[f32], copies: &mut [Cells; COPIES],
+    /// Adds the gradients around a keypoint to the cells.
+    add_patch => add_patch_body(
+        gradients: &GradientMap, size: (usize, usize), at: (f32, f32), sigma: f32, theta: f32, describer: &mut Describer,
     )
 );
 
 #[inline(always)]
-fn accumulate_body<const FMA: bool>(
+fn add_patch_body<const FMA: bool>(
+    gradients: &GradientMap,
+    (width, height): (usize, usize),
+    (x, y): (f32, f32),
+    sigma: f32,
+    theta: f32,
+    describer: &mut Describer,
+) {
+    let Describer { copies, window } = describer;
+    let (sin, cos) = theta.sin_cos();
+    let bin = BIN_SIGMAS * sigma;
+    let (du, dv) = (cos / bin, -sin / bin);
+    let (across_u, across_v) = (1.0 / du, 1.0 / dv);
+    let radius = REACH * bin * (sin.abs() + cos.abs());
+    let orientation = (theta * (gradient_map::TURN as f32 / TAU)).round() as u32;
+    let (top, bottom) = clip_to_steps(y, radius, height);
+    let (from, to) = clip_to_steps(x, radius, width);
+    let falloff = -1.0 / (FALLOFF * bin * bin);
+    for (column, weight) in (from..to).zip(&mut *window) {
+        *weight = (falloff * ((STEP * column) as f32 - x).powi(2)).exp();
+    }
+    for row in top..bottom {
+        let dy = (STEP * row) as f32 - y;
+        let (u, v) = (sin * dy / bin, cos * dy / bin);
+        let (low_u, high_u) = inside(u, across_u);
+        let (low_v, high_v) = inside(v, across_v);
+        let (low, high) = (low_u.max(low_v).max(-radius), high_u.min(high_v).min(radius));
+        if low >= high {
+            continue;
+        }
+        let (left, right) = clip_to_steps(x + 0.5 * (low + high), 0.5 * (high - low), width);
+        let (left, right) = (left.max(from), right.min(to));
+        if left >= right {
+            continue;
+        }
+        let (dx, step) = ((STEP * left) as f32 - x, STEP as f32);
+        let stretch = Stretch {
+            u: mul_add::<FMA>(du, dx, u),
+            v: mul_add::<FMA>(dv, dx, v),
+            du: step * du,
+            dv: step * dv,
+            orientation,
+            weight: (falloff * dy * dy).exp(),
+        };
+        let count = right - left;
+        let padded = count.next_multiple_of(LANES);
+        let window = &window[left - from..][..padded];
+        accumulate::<FMA>(&stretch, count, gradients.stretch(row, left, padded), window, copies);
+    }
+}
+
+/// [`clip`] for the rows or columns of a gradient map.
+#[inline(always)]
+fn clip_to_steps(center: f32, radius: f32, length: usize) -> (usize, usize) {
+    let (from, to) = clip(center, radius, length);
+    (from.div_ceil(STEP), to.div_ceil(STEP))
+}
+
+/// The range of dx with |at + dx / across| < REACH; `across` is infinite along the axis.
+#[inline(always)]
+fn inside(at: f32, across: f32) -> (f32, f32) {
+    if across.is_infinite() {
+        return if at.abs() < REACH { (f32::NEG_INFINITY, f32::INFINITY) } else { (0.0, 0.0) };
+    }
+    let (a, b) = ((-REACH - at) * across, (REACH - at) * across);
+    (a.min(b), a.max(b))
+}
+
+/// Adds the first `count` gradients of a stretch to the cells; `gradients` and `window` are whole blocks.
+#[inline(always)]
+fn accumulate<const FMA: bool>(
     stretch: &Stretch,
-    weight: &[f32],
-    direction: &[f32],
+    count: usize,
+    gradients: &[Gradient],
+    window: &[f32],
     copies: &mut [Cells; COPIES],
 ) {
     const TURN: f32 = DIRECTIONS as f32;
     let mut first_u = stretch.u + REACH;
     let mut first_v = stretch.v + REACH;
-    let shift = stretch.theta * (TURN / TAU);
-    for (weights, directions) in weight.chunks(LANES).zip(direction.chunks(LANES)) {
+    let blocks = gradients.as_chunks::<LANES>().0.iter().zip(window.as_chunks::<LANES>().0);
+    for (block, (gradients, window)) in blocks.enumerate() {
         // What each pixel adds to where, for a block of pixels at once ...
-        let (mut part_u, mut part_v, mut turn) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+        let (mut part_u, mut part_v) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+        let (mut weight, mut turn) = ([0.0_f32; LANES], [0.0_f32; LANES]);
         let mut cell = [0_u32; LANES];
         for i in 0..LANES {
             // Rounding may take a pixel of the rim a hair outside.
@@ -168,17 +201,18 @@ fn accumulate_body<const FMA: bool>(
             part_v[i] = v - row;
             cell[i] = whole_number(mul_add::<FMA>(row, RIMMED as f32, column));
         }
-        for (turn, direction) in turn.iter_mut().zip(directions) {
-            let value = mul_add::<FMA>(*direction, TURN / TAU, -shift);
-            *turn = if value < 0.0 { value + TURN } else { value };
+        for i in 0..LANES {
+            weight[i] = gradient_map::length(gradients[i]) * (window[i] * stretch.weight);
+            let direction = gradients[i].wrapping_sub(stretch.orientation) & (gradient_map::TURN - 1);
+            turn[i] = direction as i32 as f32 * (TURN / gradient_map::TURN as f32);
         }
         first_u += LANES as f32 * stretch.du;
         first_v += LANES as f32 * stretch.dv;
         // ... and the adding, for the eight directions of two neighbouring cells at once.
-        for (i, &weight) in weights.iter().enumerate() {
+        for i in 0..LANES.min(count - block * LANES) {
             let mut upper = [0.0_f32; 2 * DIRECTIONS];
             let mut lower = [0.0_f32; 2 * DIRECTIONS];
-            let (turn, part_u, part_v) = (turn[i], part_u[i], part_v[i]);
+            let (weight, turn, part_u, part_v) = (weight[i], turn[i], part_u[i], part_v[i]);
             for k in 0..2 * DIRECTIONS {
                 let away = (turn - (k % DIRECTIONS) as f32).abs();
                 let away = away.min(TURN - away);

@@ -8,6 +8,7 @@
 //!   rows that later steps still need (`octave`), so memory grows with the width of an image, not its area.
 //! - The doubled image of octave -1 comes from one Gaussian interpolation of the original pixels (`source`) instead of a
 //!   linear interpolation and a blur; it adds no blur of its own and shifts nothing.
+//! - Descriptors are not made of pixels but of gradients that neighbouring keypoints share (`gradient_map`).
 //! - Octave 0 starts from the original image, so the coarse octaves come first and the finest, which costs three times
 //!   the others together, only describes what still fits under the cap (`collector`, `forecast`).
 //!
@@ -25,6 +26,7 @@ mod descriptor;
 mod extrema;
 mod forecast;
 mod gradient;
+mod gradient_map;
 mod octave;
 mod options;
 mod orientation;

@@ -3,7 +3,8 @@
 //! With L levels per octave it has L + 3 Gaussian levels of sigma `sigma0 2^(s / L)`, s = 0..L+2; extrema are sought among
 //! the differences s+1 minus s for s = 1..L. Level s+1 is level s blurred by `sigma0 2^(s/L) sqrt(2^(2/L) - 1)`. A level is
 //! a ring of rows; asking for a row of one makes the rows it needs of the levels below. Extrema are sought row by row, and
-//! each is oriented and described at once, for which the rings reach far enough up and down.
+//! each is oriented and described at once, for which the rings, and the gradient maps that follow them, reach far enough up and
+//! down. (To describe later and keep fewer rows of the levels ahead was tried: it gains nothing.)
 
 use super::blur::{BATCH, Kernel, Scratch, blur_rows};
 use super::collector::{Class, Collector};
@@ -11,10 +12,11 @@ use super::descriptor::{self, Describer};
 use super::extrema::{self, Extremum, MAX_ROW_STEPS};
 use super::forecast::Forecast;
 use super::gradient::Patch;
+use super::gradient_map::GradientMap;
 use super::options::SiftOptions;
 use super::orientation;
 use super::ring::Ring;
-use super::simd::{Isa, prefetch};
+use super::simd::Isa;
 use super::source::Source;
 use crate::scene::Keypoint;
 
@@ -52,6 +54,8 @@ pub(super) struct Octave<'a> {
     index: i32,
     source: Source<'a>,
     levels: Levels,
+    /// Gradients of the levels in which extrema are sought, the first of level 1.
+    gradients: Vec<GradientMap>,
     /// `kernels[s]` makes level s + 1 from level s.
     kernels: Vec<Kernel>,
     scratch: Scratch,
@@ -69,26 +73,31 @@ impl<'a> Octave<'a> {
             .map(Kernel::gaussian)
             .collect();
         let near = MAX_ROW_STEPS + 2;
-        let reach = |s: usize| {
+        let reach = |s: usize, radius_px: fn(f32) -> f32| {
             if (1..=per_octave).contains(&s) {
-                near + descriptor::radius_px(level_sigma(options, s as f32 + extrema::MAX_OFFSET)).ceil() as usize
+                near + radius_px(level_sigma(options, s as f32 + extrema::MAX_OFFSET)).ceil() as usize
             } else {
                 near
             }
         };
-        let mut lead: Vec<usize> = (0..per_octave + 3).map(reach).collect();
+        let mut lead: Vec<usize> = (0..per_octave + 3).map(|s| reach(s, descriptor::radius_px)).collect();
         for s in (0..kernels.len()).rev() {
             lead[s] = lead[s].max(lead[s + 1] + BATCH - 1 + kernels[s].radius());
         }
         let rings = (0..lead.len())
             .map(|s| {
                 let kernel_radius = kernels.get(s).map_or(0, Kernel::radius);
-                Ring::new(width, (lead[s] + BATCH + reach(s).max(kernel_radius) + 2).min(height))
+                let back = reach(s, orientation::radius_px).max(kernel_radius);
+                Ring::new(width, (lead[s] + BATCH + back + 2).min(height))
             })
+            .collect();
+        let gradients = (1..=per_octave)
+            .map(|s| GradientMap::new(width, (lead[s] + BATCH + reach(s, descriptor::radius_px) + 2).min(height)))
             .collect();
         let radius = kernels.iter().map(Kernel::radius).max().unwrap_or(0).max(source.radius());
         let scratch = Scratch::new(width, radius);
-        Self { isa, options, index, source, levels: Levels { width, height, rings }, kernels, scratch, lead }
+        let levels = Levels { width, height, rings };
+        Self { isa, options, index, source, levels, gradients, kernels, scratch, lead }
     }
 
     /// The largest scale, in original pixels, of a keypoint of octave `index`.
@@ -112,6 +121,9 @@ impl<'a> Octave<'a> {
         for y in 0..height {
             for s in 0..self.levels.rings.len() {
                 self.ensure(s, y + self.lead[s]);
+            }
+            for (map, level) in self.gradients.iter_mut().zip(&self.levels.rings[1..]) {
+                map.follow(self.isa, level);
             }
             if wants_next && y.is_multiple_of(2) {
                 next.data.extend(self.levels.rings[per_octave].row(y)[..width].iter().step_by(2));
@@ -143,13 +155,7 @@ impl<'a> Octave<'a> {
             if let Some(forecast) = &mut forecast {
                 forecast.finish_row(y, self.step_px());
             }
-            if let Some(first) = extrema.first() {
-                self.prefetch_patch(first);
-            }
-            for (at, extremum) in extrema.iter().enumerate() {
-                if let Some(next) = extrema.get(at + 1) {
-                    self.prefetch_patch(next);
-                }
+            for extremum in &extrema {
                 self.describe(extremum, &mut worker, collector);
             }
         }
@@ -211,18 +217,6 @@ impl<'a> Octave<'a> {
         (extremum.x * step + offset, extremum.y * step + offset)
     }
 
-    /// Asks for the pixels that an extremum's description reads. The rings of a wide image lie in the third-level cache, and
-    /// a patch takes a few short pieces of some fifty rows, which no hardware foresees: without this, waiting for them is
-    /// half the time of the gradients.
-    fn prefetch_patch(&self, extremum: &Extremum) {
-        let radius = descriptor::radius_px(level_sigma(self.options, extremum.level));
-        let (from, to) = orientation::clip(extremum.x, radius, self.levels.width);
-        let (top, bottom) = orientation::clip(extremum.y, radius, self.levels.height);
-        for y in top..bottom {
-            prefetch(&self.levels.rings[extremum.s].row(y)[from..to.max(from)]);
-        }
-    }
-
     /// Turns an extremum into features.
     fn describe(&self, extremum: &Extremum, worker: &mut Worker, collector: &mut Collector<'_>) {
         let sigma = level_sigma(self.options, extremum.level);
@@ -232,12 +226,12 @@ impl<'a> Octave<'a> {
             return;
         }
         let (x, y) = self.place_px(extremum);
-        let ring = &self.levels.rings[extremum.s];
+        let (ring, gradients) = (&self.levels.rings[extremum.s], &self.gradients[extremum.s - 1]);
         let size = (self.levels.width, self.levels.height);
         let (at, patch) = ((extremum.x, extremum.y), &mut worker.patch);
         for orientation in orientation::find(self.isa, ring, size, at, sigma, self.options.max_orientations, patch) {
             let keypoint = Keypoint { x, y, scale, orientation };
-            let descriptor = worker.describer.describe(self.isa, ring, size, at, sigma, orientation, patch);
+            let descriptor = worker.describer.describe(self.isa, gradients, size, at, sigma, orientation);
             collector.push(class, keypoint, descriptor);
         }
     }

@@ -2,7 +2,7 @@
 
 use std::f32::consts::TAU;
 
-use super::gradient::{Every, LANES, Patch};
+use super::gradient::{LANES, Patch};
 use super::ring::Ring;
 use super::simd::{Isa, stamp, whole_number};
 
@@ -16,36 +16,28 @@ const CUTOFF: f32 = 3.0;
 const PEAK_PART: f32 = 0.8;
 /// Histograms that pixels are added to in turn, so that none waits for the sum before it.
 const COPIES: usize = 4;
+/// The histograms; the bin after the last holds what that shares with the first.
+type Histograms = [[f32; BINS + 1]; COPIES];
 /// Passes of the smoothing filter (1 4 6 4 1) / 16 over the histogram.
 const SMOOTHINGS: usize = 1;
+
+/// How far from a keypoint of this sigma its orientation is taken from, in the same pixels.
+pub(super) fn radius_px(sigma: f32) -> f32 {
+    CUTOFF * WINDOW_SIGMAS * sigma
+}
 
 /// The orientations in [0, 2 pi) of the highest peaks, highest first, at most `most`.
 pub(super) fn find(
     isa: Isa,
     ring: &Ring,
-    (width, height): (usize, usize),
-    (x, y): (f32, f32),
+    size: (usize, usize),
+    at: (f32, f32),
     sigma: f32,
     most: usize,
     patch: &mut Patch,
 ) -> Vec<f32> {
-    let window = WINDOW_SIGMAS * sigma;
-    let radius = CUTOFF * window;
-    let falloff = -0.5 / (window * window);
     let mut copies = [[0.0_f32; BINS + 1]; COPIES];
-    let (top, bottom) = clip(y, radius, height);
-    let (from, to) = clip(x, radius, width);
-    patch.set_window(x, falloff, from, to, Every::Pixel);
-    for row in top..bottom {
-        let dy = row as f32 - y;
-        let half = (radius * radius - dy * dy).max(0.0).sqrt();
-        let (left, right) = clip(x, half, width);
-        if left >= right {
-            continue;
-        }
-        let count = patch.fill(isa, ring, row, left, right, (falloff * dy * dy).exp());
-        add_to_histograms(isa, &patch.weight[..count], &patch.direction[..count], &mut copies);
-    }
+    add_window(isa, ring, size, at, sigma, patch, &mut copies);
     let mut histogram = [0.0_f32; BINS + 1];
     for copy in &copies {
         for (sum, value) in histogram.iter_mut().zip(copy) {
@@ -64,15 +56,43 @@ pub(super) fn find(
 }
 
 stamp!(
-    /// Shares each weight between the two bins nearest to its direction; the bin after the last takes what that shares with
-    /// the first.
-    add_to_histograms => add_to_histograms_body(
-        weight: &[f32], direction: &[f32], copies: &mut [[f32; BINS + 1]; COPIES],
+    /// Adds the gradients around a keypoint to the histograms.
+    add_window => add_window_body(
+        ring: &Ring, size: (usize, usize), at: (f32, f32), sigma: f32, patch: &mut Patch, copies: &mut Histograms,
     )
 );
 
 #[inline(always)]
-fn add_to_histograms_body<const FMA: bool>(weight: &[f32], direction: &[f32], copies: &mut [[f32; BINS + 1]; COPIES]) {
+fn add_window_body<const FMA: bool>(
+    ring: &Ring,
+    (width, height): (usize, usize),
+    (x, y): (f32, f32),
+    sigma: f32,
+    patch: &mut Patch,
+    copies: &mut Histograms,
+) {
+    let window = WINDOW_SIGMAS * sigma;
+    let radius = radius_px(sigma);
+    let falloff = -0.5 / (window * window);
+    let (top, bottom) = clip(y, radius, height);
+    let (from, to) = clip(x, radius, width);
+    patch.set_window(x, falloff, from, to);
+    for row in top..bottom {
+        let dy = row as f32 - y;
+        let half = (radius * radius - dy * dy).max(0.0).sqrt();
+        let (left, right) = clip(x, half, width);
+        if left >= right {
+            continue;
+        }
+        let count = patch.fill::<FMA>(ring, row, left, right, (falloff * dy * dy).exp());
+        add_to_histograms(&patch.weight[..count], &patch.direction[..count], copies);
+    }
+}
+
+/// Shares each weight between the two bins nearest to its direction; the bin after the last takes what that shares with
+/// the first.
+#[inline(always)]
+fn add_to_histograms(weight: &[f32], direction: &[f32], copies: &mut Histograms) {
     for (weights, directions) in weight.chunks(LANES).zip(direction.chunks(LANES)) {
         let (mut first, mut part) = ([0_u32; LANES], [0.0_f32; LANES]);
         for (i, direction) in directions.iter().enumerate() {
@@ -91,7 +111,7 @@ fn add_to_histograms_body<const FMA: bool>(weight: &[f32], direction: &[f32], co
 }
 
 /// The whole pixels within `radius` of `center` that are not on the border, as a half-open range.
-#[inline]
+#[inline(always)]
 pub(super) fn clip(center: f32, radius: f32, length: usize) -> (usize, usize) {
     // Without these, `ceil` and `floor` are library calls on the x86-64 baseline, for every row of every keypoint.
     let above = |value: f32| value as i32 + i32::from((value as i32 as f32) < value);

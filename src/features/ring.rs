@@ -9,19 +9,19 @@ pub(super) fn padded(length: usize) -> usize {
 }
 
 /// The last `capacity` rows of an image.
-pub(super) struct Ring {
+pub(super) struct Ring<T = f32> {
     /// Values a row takes: whole blocks and a block of margin, so that a stretch of whole blocks may start at any pixel.
     stride: usize,
     capacity: usize,
     next: usize,
-    data: Vec<f32>,
+    data: Vec<T>,
 }
 
-impl Ring {
+impl<T: Copy + Default> Ring<T> {
     /// An empty ring for rows of `width` values.
     pub(super) fn new(width: usize, capacity: usize) -> Self {
         let stride = padded(width) + BLOCK;
-        Self { stride, capacity, next: 0, data: vec![0.0; stride * capacity] }
+        Self { stride, capacity, next: 0, data: vec![T::default(); stride * capacity] }
     }
 
     /// Number of rows pushed so far, the index of the next.
@@ -31,7 +31,7 @@ impl Ring {
 
     /// Row `y` with its padding, which must be among the last `capacity`.
     #[inline]
-    pub(super) fn row(&self, y: usize) -> &[f32] {
+    pub(super) fn row(&self, y: usize) -> &[T] {
         debug_assert!(y < self.next && y + self.capacity >= self.next, "row {y} of {} is gone", self.next);
         let start = (y % self.capacity) * self.stride;
         &self.data[start..start + self.stride - BLOCK]
@@ -39,14 +39,14 @@ impl Ring {
 
     /// `length` values of row `y` from column `from` on, which may end in the margin.
     #[inline]
-    pub(super) fn stretch(&self, y: usize, from: usize, length: usize) -> &[f32] {
+    pub(super) fn stretch(&self, y: usize, from: usize, length: usize) -> &[T] {
         debug_assert!(y < self.next && y + self.capacity >= self.next && from + length <= self.stride);
         let start = (y % self.capacity) * self.stride + from;
         &self.data[start..start + length]
     }
 
     /// Makes room for the next `count` rows (fewer than the capacity) and returns them in order, to be filled.
-    pub(super) fn push_rows(&mut self, count: usize) -> Vec<&mut [f32]> {
+    pub(super) fn push_rows(&mut self, count: usize) -> Vec<&mut [T]> {
         let first = self.next % self.capacity;
         self.next += count;
         let length = self.stride - BLOCK;
@@ -56,7 +56,7 @@ impl Ring {
     }
 
     /// Makes room for the next row and returns it, to be filled.
-    pub(super) fn push(&mut self) -> &mut [f32] {
+    pub(super) fn push(&mut self) -> &mut [T] {
         let start = (self.next % self.capacity) * self.stride;
         self.next += 1;
         &mut self.data[start..start + self.stride - BLOCK]

@@ -68,19 +68,6 @@ pub(super) fn whole_number(value: f32) -> u32 {
     (value + SHIFT).to_bits() & 0x7f_ffff
 }
 
-/// Asks for the cache lines of these values, which will be read soon. Does nothing where there is no such instruction.
-#[inline(always)]
-pub(super) fn prefetch(values: &[f32]) {
-    #[cfg(target_arch = "x86_64")]
-    for line in values.chunks(64 / size_of::<f32>()) {
-        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // SAFETY: prefetching reads nothing, whatever the address; part of the baseline.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = values;
-}
-
 /// Defines `fn name(isa, arguments)` that runs `body::<FMA>(arguments)` compiled for `isa`.
 macro_rules! stamp {
     ($(#[$doc:meta])* $name:ident => $body:ident ( $($arg:ident : $kind:ty),* $(,)? ) $(-> $out:ty)?) => {
