@@ -1,6 +1,6 @@
 //! The stages `coarse_match` and `coarse_model`, widened when the largest scales alone do not connect enough images.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use super::coarse_match::{CoarseMatches, Matcher};
@@ -19,7 +19,7 @@ use crate::coarse::look_alikes::{self, CutPair, LookAlikeAccount};
 use crate::coarse::rotation_cycles::RotationForest;
 use crate::coarse::selection::SelectionOptions;
 use crate::coarse::{CoarseModels, MapperImage, MapperInput, MapperRun, MatchGraph};
-use crate::scene::{ApartImages, CameraId, ImageId};
+use crate::scene::{ApartImages, CameraId, ImageId, Reconstruction, RegisteredImage};
 
 /// Number of coarse matches of every pair that was matched, verified or not: what ranked matching goes by.
 pub type PairMatchCounts = MatchCounts;
@@ -40,7 +40,7 @@ pub struct Coarse {
 
 /// Matches and reconstructs the largest scales; widens the selection while too few images are registered and keeps the best.
 ///
-/// A selection takes over the pairs among the images of the largest model so far. Not so after the trial: where its few
+/// A selection takes over the pairs among those images that the largest model so far holds firmly. Not so after the trial: where its few
 /// features leave images out, they hold the others together but weakly, too, and a street of 29 photographs went astray at
 /// such joins. And where the trial finds look-alikes, it isn't trusted to tell them apart. So a trial is taken or forgotten.
 pub fn run(
@@ -61,10 +61,8 @@ pub fn run(
     let tries = trial.into_iter().chain(selections.map(|selection| (selection, false)));
     for (round, (selection, is_trial)) in (1u32..).zip(tries) {
         let iteration = (round > 1).then_some(round);
-        let settled = best
-            .as_ref()
-            .and_then(|(models, _)| models.models.first())
-            .map(|model| model.images().keys().copied().collect());
+        let settled = best.as_ref().and_then(|(models, _)| models.models.first());
+        let settled = settled.map(|model| firmly_held(model, full.settled_from_points)).unwrap_or_default();
         let match_key = ArtifactKey::of("coarse_match", &[&base_key.0, &selection]);
         let matches: CoarseMatches = runner.stage(
             StageKey { stage: Stage::CoarseMatch, iteration },
@@ -81,7 +79,7 @@ pub fn run(
                     features: &features,
                     context,
                 };
-                let result = matcher.run(&before, &settled.unwrap_or_default(), progress)?;
+                let result = matcher.run(&before, &settled, progress)?;
                 features.check(Stage::CoarseMatch)?;
                 Ok(result)
             },
@@ -179,6 +177,12 @@ pub fn run(
     Ok(Coarse { state, match_counts: before.match_counts, rotations, cameras: before.cameras, cut: account.cut })
 }
 
+/// The images that a model sees at least so many points of.
+fn firmly_held(model: &Reconstruction, from_points: usize) -> BTreeSet<ImageId> {
+    let sees_enough = |image: &RegisteredImage| image.num_observations() >= from_points;
+    model.images().iter().filter(|(_, image)| sees_enough(image)).map(|(&id, _)| id).collect()
+}
+
 /// What was left out because it stands still in the frame, if anything was.
 fn background_note(matches: &CoarseMatches) -> Option<String> {
     let count = matches.before_background.len();
@@ -256,4 +260,26 @@ fn mapper_input(intake: &Intake, features: &StoredFeatures<'_>, matches: &Coarse
 fn positions(stored: &StoredFeatures<'_>, id: ImageId) -> Arc<[Pixel]> {
     let features = stored.read(id, None);
     features.keypoints.iter().map(|keypoint| Pixel::new(f64::from(keypoint.x), f64::from(keypoint.y))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{KeypointIdx, Observation};
+    use crate::synthetic::{SceneOptions, generate};
+
+    #[test]
+    fn an_image_is_held_firmly_by_enough_points() {
+        let mut model = generate(&SceneOptions { num_images: 5, num_points: 300, ..SceneOptions::default() }).truth;
+        let all: BTreeSet<ImageId> = model.images().keys().copied().collect();
+        let weak = *all.first().unwrap();
+        let seen = (0u32..).map(KeypointIdx).zip(model.images()[&weak].points().to_vec());
+        let seen: Vec<_> = seen.filter_map(|(keypoint, point)| Some((point?, keypoint))).collect();
+        assert!(seen.len() > 20);
+        for &(point, keypoint) in &seen[20..] {
+            model.remove_observation(point, Observation { image: weak, keypoint });
+        }
+        assert_eq!(firmly_held(&model, 20), all);
+        assert_eq!(firmly_held(&model, 21), &all - &BTreeSet::from([weak]));
+    }
 }
