@@ -11,6 +11,7 @@
 
 use std::f32::consts::{SQRT_2, TAU};
 
+use super::gradient::LANES;
 use super::gradient_map::{self, Gradient, GradientMap, STEP};
 use super::orientation::clip;
 use super::simd::{Isa, mul_add, stamp, whole_number};
@@ -37,8 +38,6 @@ const CLIP: f32 = 0.2;
 /// Quantisation of the square roots.
 const QUANTISATION: f32 = 512.0;
 
-/// Gradients taken together.
-const LANES: usize = 16;
 /// Gradients of the longest row of a patch: across the widest descriptor of the largest sigma.
 const MAX_STRETCH: usize = 512;
 
