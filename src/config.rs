@@ -20,8 +20,8 @@ pub struct UploadLimits {
     pub max_files: usize,
     /// Bytes of one photograph.
     pub max_file_bytes: u64,
-    /// A photograph of at most so many bytes that comes whole with the request that makes its resumable upload waits in memory until
-    /// all of it is there; others are written as they come.
+    /// A photograph of at most so many bytes that comes whole with the request that makes its resumable upload waits in
+    /// memory until all of it is there; others are written as they come.
     pub memory_file_bytes: u64,
     /// Memory of all that wait so; when it is used up, they too are written as they come.
     pub memory_bytes: u64,

@@ -1,8 +1,9 @@
 //! Visual words: the descriptor space cut into cells by k-means, in two levels.
 //!
-//! Trained on the model's own descriptors, because they are what will be looked for. Lloyd's iterations from random members of
-//! the training set (always the same ones), with exact nearest centres from the matching kernels and centres rounded to bytes, so that
-//! training is exact integer work and the same everywhere. The coarser level clusters the centres of the finer one.
+//! Trained on the model's own descriptors, because they are what will be looked for. Lloyd's iterations from random
+//! members of the training set (always the same ones), with exact nearest centres from the matching kernels and centres
+//! rounded to bytes, so that training is exact integer work and the same everywhere. The coarser level clusters the
+//! centres of the finer one.
 
 use rayon::prelude::*;
 

@@ -35,8 +35,8 @@ struct Neighbor {
     shared: usize,
 }
 
-/// The pairs to match, each once, by ascending ids; none of images that are known to be apart. With `new_images`, only pairs with at least one of them (the paper's
-/// second iteration).
+/// The pairs to match, each once, by ascending ids; none of images that are known to be apart. With `new_images`, only
+/// pairs with at least one of them (the paper's second iteration).
 pub fn candidate_pairs(
     model: &Reconstruction,
     new_images: Option<&BTreeSet<ImageId>>,

@@ -1,8 +1,8 @@
 //! The nearest candidate of each query of one image in another, and the ratio test (paper, sections 6.2.2 and 6.2.3): one
 //! direction of a guided match.
 //!
-//! Two ways: a sweep of all queries' bands ([`super::sweep`]), or, as the paper has it, the queries in groups with a common line
-//! whose candidates are gathered once ([`super::line_groups`], [`super::candidate_search`]).
+//! Two ways: a sweep of all queries' bands ([`super::sweep`]), or, as the paper has it, the queries in groups with a
+//! common line whose candidates are gathered once ([`super::line_groups`], [`super::candidate_search`]).
 
 use super::candidate_search::{CandidateSearch, SeenMarks};
 use super::epipolar::{BoundingBox, EpipolarGeometry, EpipolarLine};

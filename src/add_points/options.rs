@@ -106,8 +106,8 @@ pub struct GuidedMatchOptions {
     pub ratio_both_ways: bool,
     /// Whether a match must triangulate in front of both cameras.
     pub cheirality: bool,
-    /// Which matches are no part of the scene, as they stand still in the frame: an epipolar line that lies along the motion does not
-    /// tell them from others.
+    /// Which matches are no part of the scene, as they stand still in the frame: an epipolar line that lies along the
+    /// motion does not tell them from others.
     pub standing: StandingOptions,
     /// Largest factor by which the ratio of both keypoints' scales may differ from the one their depths foretell; none
     /// turns the gate off.
@@ -240,9 +240,9 @@ impl PixelScaling {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BlockOptions {
-    /// Pairs are worked through in tiles of this many images by as many (or as there are threads, if more): at most twice this
-    /// many images' features (about 4 MB each) are in memory at a time. Smaller tiles read features more often: on 128 images of
-    /// 17,000 features 8 takes 2 % more CPU time than 64, and 120 MB less.
+    /// Pairs are worked through in tiles of this many images by as many (or as there are threads, if more): at most
+    /// twice this many images' features (about 4 MB each) are in memory at a time. Smaller tiles read features more
+    /// often: on 128 images of 17,000 features 8 takes 2 % more CPU time than 64, and 120 MB less.
     pub images_per_block: usize,
 }
 

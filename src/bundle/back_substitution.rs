@@ -1,7 +1,8 @@
 //! From the step of the cameras to the step of the points, and the cost where both lead: a second pass over the sightings.
 //!
-//! With the letters of [`super::elimination`], `dp = -V^-1 (gp + W' dc)` per point. `W' dc` is not taken from a stored `W`: with
-//! `u` the change of the pixel that the step of the cameras makes to first order, `gp + W' dc = sum R'J' w (e + u)`.
+//! With the letters of [`super::elimination`], `dp = -V^-1 (gp + W' dc)` per point. `W' dc` is not taken from a stored
+//! `W`: with `u` the change of the pixel that the step of the cameras makes to first order,
+//! `gp + W' dc = sum R'J' w (e + u)`.
 
 use super::elimination::{MIN_DEPTH, cross, rotate};
 use super::pattern::Part;

@@ -6,9 +6,9 @@
 //!   [ U  W ] [dc]     [gc]
 //!   [ W' V ] [dp] = - [gp]
 //!
-//! where `V` is block diagonal with a 3x3 block per point. With `V = L L'` and, per point, `Z = L^-1 W'` (three rows) and
-//! `z = L^-1 gp`, eliminating the points leaves the reduced camera system (Brown, 1958; Triggs, McLauchlan, Hartley, Fitzgibbon,
-//! "Bundle adjustment: a modern synthesis", 1999, section 6)
+//! where `V` is block diagonal with a 3x3 block per point. With `V = L L'` and, per point, `Z = L^-1 W'` (three rows)
+//! and `z = L^-1 gp`, eliminating the points leaves the reduced camera system (Brown, 1958; Triggs, McLauchlan,
+//! Hartley, Fitzgibbon, "Bundle adjustment: a modern synthesis", 1999, section 6)
 //!
 //!   S dc = -b,    S = U - sum Z' Z,    b = gc - sum Z' z.
 //!

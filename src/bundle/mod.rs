@@ -42,8 +42,8 @@ pub fn adjust(model: &mut Reconstruction, config: &BundleConfig, options: &Bundl
     adjust_while(model, config, options, &|| true)
 }
 
-/// [`adjust`] that ends early once `keep_going` says no, with the best state found until then. It is asked twice a step: the wait
-/// is at most a pass over the sightings, or one solution of the reduced system.
+/// [`adjust`] that ends early once `keep_going` says no, with the best state found until then. It is asked twice a
+/// step: the wait is at most a pass over the sightings, or one solution of the reduced system.
 pub fn adjust_while(
     model: &mut Reconstruction,
     config: &BundleConfig,

@@ -1,6 +1,7 @@
 //! Options of a run from a JSON file and from `--set a.b=value`, over the defaults.
 //!
-//! The defaults, as JSON, say which names there are, so that a wrong name or value is answered with the full name of the option.
+//! The defaults, as JSON, say which names there are, so that a wrong name or value is answered with the full name of
+//! the option.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;

@@ -25,8 +25,8 @@ pub(super) struct Args {
     /// Address to listen on; port 0 takes a free one. Beyond this machine, every request needs a token.
     #[arg(long, env = "MULTISTAGE_BIND", default_value = "127.0.0.1:8080")]
     bind: SocketAddr,
-    /// Serve clients of NodeODM (WebODM, CloudODM, PyODM) as well, at this address, such as 127.0.0.1:3000. Beyond this machine,
-    /// every request needs a token.
+    /// Serve clients of NodeODM (WebODM, CloudODM, PyODM) as well, at this address, such as 127.0.0.1:3000. Beyond this
+    /// machine, every request needs a token.
     #[arg(long, env = "MULTISTAGE_NODEODM_BIND")]
     nodeodm_bind: Option<SocketAddr>,
     /// Serve without tokens beyond this machine too: whoever reaches the address may do everything.
@@ -75,8 +75,8 @@ pub(super) struct Args {
     /// Photographs that one upload may bring [default: 100000].
     #[arg(long, env = "MULTISTAGE_MAX_FILES")]
     max_files: Option<NonZeroUsize>,
-    /// Bytes up to which a photograph waits in memory until all of it has come; larger ones are written as they come. 0 for none
-    /// [default: 4 MiB].
+    /// Bytes up to which a photograph waits in memory until all of it has come; larger ones are written as they come. 0
+    /// for none [default: 4 MiB].
     #[arg(long, env = "MULTISTAGE_UPLOAD_MEMORY_FILE_BYTES")]
     upload_memory_file_bytes: Option<u64>,
     /// Bytes of memory that all photographs that wait so may take; when they are used up, further ones are written as they come

@@ -21,8 +21,9 @@ pub struct IntrinsicsOptions {
     pub min_model_images_for_distortion: usize,
     /// Whether the principal point is estimated or held in the middle of the picture.
     pub principal_point: PrincipalPoint,
-    /// Images sharing a camera before its principal point is freed. Measured on sets of four to seven surveyed photographs, freeing
-    /// it raises the AUC at 1 degree from 65 to 91 (own focal lengths for all, as COLMAP has them: 81); with three it may go astray.
+    /// Images sharing a camera before its principal point is freed. Measured on sets of four to seven surveyed
+    /// photographs, freeing it raises the AUC at 1 degree from 65 to 91 (own focal lengths for all, as COLMAP has them:
+    /// 81); with three it may go astray.
     pub min_images_for_principal_point: usize,
     /// Images sharing a camera before it gets two radial coefficients.
     pub min_images_for_radial: usize,
@@ -34,10 +35,10 @@ pub struct IntrinsicsOptions {
     pub refine: bool,
     /// The focal length that photographs without EXIF are expected to have, as a share of the longer side: [`TYPICAL_FOCAL`].
     pub typical_focal: f64,
-    /// Standard deviation of its logarithm; null leaves such focal lengths without a prior. It covers wide lenses and short
-    /// telephotos, and weighs no more than one sighting, so it decides only where the sightings leave a focal length open: of
-    /// nine runs on a street of 29 photographs without EXIF, four ended at 20 to 12,000 times the longer side without it, and none
-    /// of eight beyond 7 with it.
+    /// Standard deviation of its logarithm; null leaves such focal lengths without a prior. It covers wide lenses and
+    /// short telephotos, and weighs no more than one sighting, so it decides only where the sightings leave a focal
+    /// length open: of nine runs on a street of 29 photographs without EXIF, four ended at 20 to 12,000 times the
+    /// longer side without it, and none of eight beyond 7 with it.
     pub typical_focal_sigma_log: Option<f64>,
     /// Share up to which the focal lengths of two cameras of one image size, neither from EXIF, agree: they are one camera.
     pub agreeing_focal_difference: f64,

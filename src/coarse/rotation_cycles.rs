@@ -1,11 +1,11 @@
-//! Relative rotations of pairs as a check on weaker ones. Repeated texture (tiles, boards, lamellas) gives pairs that agree in a few
-//! tens of matches and are wrong; their baselines look wide, so a model would even start from them. And it gives poses that agree
-//! with a few tens of points and are wrong.
+//! Relative rotations of pairs as a check on weaker ones. Repeated texture (tiles, boards, lamellas) gives pairs that
+//! agree in a few tens of matches and are wrong; their baselines look wide, so a model would even start from them. And
+//! it gives poses that agree with a few tens of points and are wrong.
 //!
-//! Along a closed chain of pairs the relative rotations multiply to the identity (Zach, Klopschitz, Pollefeys, "Disambiguating
-//! visual relations using loop constraints", CVPR 2010). The chain to hold a pair or a pose against is the one whose weakest link
-//! is strongest, that is a path in a maximum spanning tree by inliers. Panoramic pairs are links, too: they know no depth, but how
-//! the camera was turned they know best.
+//! Along a closed chain of pairs the relative rotations multiply to the identity (Zach, Klopschitz, Pollefeys,
+//! "Disambiguating visual relations using loop constraints", CVPR 2010). The chain to hold a pair or a pose against is
+//! the one whose weakest link is strongest, that is a path in a maximum spanning tree by inliers. Panoramic pairs are
+//! links, too: they know no depth, but how the camera was turned they know best.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -27,8 +27,8 @@ pub struct RotationCycleOptions {
     pub enabled: bool,
     /// Every link of the chain that a pair or a pose is held against has at least so many times its inliers.
     pub min_times_stronger: f64,
-    /// Rotations that differ by more than this contradict each other, in degrees. Wrong ones differ by any angle; those of short
-    /// baselines before a plane are off by a few degrees.
+    /// Rotations that differ by more than this contradict each other, in degrees. Wrong ones differ by any angle; those
+    /// of short baselines before a plane are off by a few degrees.
     pub max_angle_deg: f64,
     /// More for every link of the chain, whose errors add up, in degrees.
     pub link_angle_deg: f64,
@@ -95,8 +95,9 @@ impl RotationForest {
         forest
     }
 
-    /// Whether a rotation found from so many inliers is contradicted: by the shortest chain of much stronger links from the image
-    /// to one whose rotation is known (`goal_from_image` gives what the rotation in question says of it), if there is any.
+    /// Whether a rotation found from so many inliers is contradicted: by the shortest chain of much stronger links from
+    /// the image to one whose rotation is known (`goal_from_image` gives what the rotation in question says of it), if
+    /// there is any.
     fn contradicts(
         &self,
         image: ImageId,

@@ -27,14 +27,15 @@ pub struct SelectionOptions {
     pub trial_max_features: Option<usize>,
     /// A trial is made from this many images on; in smaller sets matching takes too small a part of the time.
     pub trial_from_images: usize,
-    /// The trial is forgotten, too, when more than this share of the pairs that it doubted are held apart as look-alikes: places
-    /// that look alike need all the evidence. Of 24 random subsets of one desk with the same books twice, trials folded 2, and
-    /// 2560 features none. Measured: 0 to 0.08 where there are none, 0.6 to 0.9 where there are.
+    /// The trial is forgotten, too, when more than this share of the pairs that it doubted are held apart as
+    /// look-alikes: places that look alike need all the evidence. Of 24 random subsets of one desk with the same books
+    /// twice, trials folded 2, and 2560 features none. Measured: 0 to 0.08 where there are none, 0.6 to 0.9 where there
+    /// are.
     pub trial_max_apart_share: f64,
-    /// A wider selection doesn't match those images with each other anew that the largest model so far sees at least this many points
-    /// of. Lower: less time for sets of which a part is hard; but a model of few points may hold together by joins that are
-    /// too weak to trust. Ours: of ten runs on a street of 29 photographs, four went astray when all images of such a model kept
-    /// their pairs, and none with this.
+    /// A wider selection doesn't match those images with each other anew that the largest model so far sees at least
+    /// this many points of. Lower: less time for sets of which a part is hard; but a model of few points may hold
+    /// together by joins that are too weak to trust. Ours: of ten runs on a street of 29 photographs, four went astray
+    /// when all images of such a model kept their pairs, and none with this.
     pub settled_from_points: usize,
 }
 

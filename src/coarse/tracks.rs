@@ -21,8 +21,8 @@ pub struct Tracks {
 }
 
 impl Tracks {
-    /// Builds the tracks of a graph, none of which joins images that are apart. Once `keep_going`, which is asked for every pair,
-    /// says no, further pairs are left out.
+    /// Builds the tracks of a graph, none of which joins images that are apart. Once `keep_going`, which is asked for
+    /// every pair, says no, further pairs are left out.
     pub fn build(graph: &MatchGraph, apart: &ApartImages, keep_going: &KeepGoing) -> Self {
         let mut builder = TrackBuilder::new(graph, apart);
         let mut order: Vec<_> = graph.pairs.iter().collect();

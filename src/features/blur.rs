@@ -87,8 +87,9 @@ pub(super) fn extend_border(values: &mut [f32], margin: usize, width: usize) {
 
 /// Weighted sums of the rows `around` each of the rows `outs`; `weights` has [`BATCH`] - 1 zeros before and after.
 ///
-/// The sums of a piece of the rows must fit the registers beside the values loaded: 32 registers of 16 floats hold pieces of 32,
-/// 16 registers of 8 floats pieces of 16 (with 32 the compiler stores and loads sums within the loop, at twice the time).
+/// The sums of a piece of the rows must fit the registers beside the values loaded: 32 registers of 16 floats hold
+/// pieces of 32, 16 registers of 8 floats pieces of 16 (with 32 the compiler stores and loads sums within the loop, at
+/// twice the time).
 fn blur_columns(isa: Isa, weights: &[f32], around: &[&[f32]], outs: [&mut [f32]; BATCH]) {
     if isa.has_many_registers() {
         blur_columns_wide(isa, weights, around, outs);

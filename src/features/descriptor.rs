@@ -11,7 +11,7 @@
 
 use std::f32::consts::{SQRT_2, TAU};
 
-use super::gradient::LANES;
+use super::gradient::{LANES, fill_window};
 use super::gradient_map::{self, Gradient, GradientMap, STEP};
 use super::orientation::clip;
 use super::simd::{Isa, mul_add, stamp, whole_number};
@@ -123,9 +123,7 @@ fn add_patch_body<const FMA: bool>(
     let (top, bottom) = clip_to_steps(y, radius, height);
     let (from, to) = clip_to_steps(x, radius, width);
     let falloff = -1.0 / (FALLOFF * bin * bin);
-    for (column, weight) in (from..to).zip(&mut *window) {
-        *weight = (falloff * ((STEP * column) as f32 - x).powi(2)).exp();
-    }
+    fill_window(window, (from..to).map(|column| (STEP * column) as f32 - x), falloff);
     for row in top..bottom {
         let dy = (STEP * row) as f32 - y;
         let (u, v) = (sin * dy / bin, cos * dy / bin);

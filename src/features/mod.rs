@@ -12,10 +12,11 @@
 //! - Octave 0 starts from the original image, so the coarse octaves come first and the finest, which costs three times
 //!   the others together, only describes what still fits under the cap (`collector`, `forecast`).
 //!
-//! Where the time goes (3072x2048, 26,624 features, one core of a Zen 5: 0.16 s): a quarter into descriptors, limited by the
-//! arithmetic of adding each gradient to 2 x 2 x 8 bins (about 9 cycles each, 6 would be the least), and a fiftieth into the gradients
-//! they share; a sixth into orientations, limited by the roots and divisions of their gradients; a quarter into blurs and differences,
-//! of which the blur along rows is limited by loads that straddle cache lines; a seventh into the search for extrema.
+//! Where the time goes (3072x2048, 26,624 features, one core of a Zen 5: 0.16 s): a quarter into descriptors, limited
+//! by the arithmetic of adding each gradient to 2 x 2 x 8 bins (about 9 cycles each, 6 would be the least), and a
+//! fiftieth into the gradients they share; a sixth into orientations, limited by the roots and divisions of their
+//! gradients; a quarter into blurs and differences, of which the blur along rows is limited by loads that straddle
+//! cache lines; a seventh into the search for extrema.
 //!
 //! Everything is single precision and single-threaded; the kernels are stamped out for several instruction sets (`simd`)
 //! from one body, whose portable version is the oracle of the others.
@@ -52,8 +53,8 @@ const MIN_OCTAVE_SIDE: usize = 8;
 /// foretell what is worth describing in it; making their first level then costs its first blurs twice.
 const OCTAVE_0_DENSITY: f64 = 0.006;
 
-/// The SIFT features of an image: at most [`SiftOptions::limit`] distinct ones, those of the largest scales, and where there are
-/// fewer than [`SiftOptions::faint_up_to`], so many with faint ones.
+/// The SIFT features of an image: at most [`SiftOptions::limit`] distinct ones, those of the largest scales, and where
+/// there are fewer than [`SiftOptions::faint_up_to`], so many with faint ones.
 ///
 /// Images too small to hold a keypoint give no features. The result depends on nothing but the input and the machine's
 /// instruction set.

@@ -18,8 +18,8 @@ pub struct SiftOptions {
     /// Least of a faint one; at most `peak_threshold`. Origin: measured. Guided matching and the ratio test leave out what does
     /// not repeat, so that 0.0018 gives dark and smooth images a third more points.
     pub faint_threshold: f32,
-    /// Faint features are only taken, those of the largest scales, by images that have fewer distinct ones than this, to make up
-    /// this number. Lowering it saves time on images of little texture and costs them points.
+    /// Faint features are only taken, those of the largest scales, by images that have fewer distinct ones than this,
+    /// to make up this number. Lowering it saves time on images of little texture and costs them points.
     pub faint_up_to: usize,
     /// Largest ratio of the two principal curvatures; lowering it drops more edge responses. Origin: measured; Lowe 2004,
     /// section 4.1, has 10.

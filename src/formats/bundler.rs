@@ -8,12 +8,13 @@
 //! in pixels from the image centre, x to the right and y up.
 //!
 //! **What is written as a measured position.** Bundler's camera has one focal length, two radial coefficients, and its
-//! principal point in the middle of the image. Our cameras may have the principal point elsewhere, two focal lengths and
-//! tangential distortion. Therefore the position of a sighting is written as `p' + e`, the projection by the Bundler
-//! camera in the file plus our residual `e = keypoint - projection` (its y turned up). A reader of the file alone thus finds
-//! our reprojection errors exactly. For a camera without tangential distortion and with one focal length, `f, k1, k2` are our
-//! own, and `p' + e` is the keypoint as seen from the principal point: the plain Bundler convention wherever that is the
-//! image centre. For other cameras `f, k1, k2` are those that come nearest to our projection over the whole image, by least squares.
+//! principal point in the middle of the image. Our cameras may have the principal point elsewhere, two focal lengths
+//! and tangential distortion. Therefore the position of a sighting is written as `p' + e`, the projection by the
+//! Bundler camera in the file plus our residual `e = keypoint - projection` (its y turned up). A reader of the file
+//! alone thus finds our reprojection errors exactly. For a camera without tangential distortion and with one focal
+//! length, `f, k1, k2` are our own, and `p' + e` is the keypoint as seen from the principal point: the plain Bundler
+//! convention wherever that is the image centre. For other cameras `f, k1, k2` are those that come nearest to our
+//! projection over the whole image, by least squares.
 //!
 //! Reference: Snavely, "Bundler v0.4 User's Manual", 2009, section "Output format and scene representation".
 
@@ -23,6 +24,7 @@ use std::io::{self, BufRead, Write};
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::FormatError;
+use super::shortest::Shortest;
 use crate::camera::{Camera, CameraModel, Pixel};
 use crate::geometry::Rigid3;
 use crate::scene::{ImageId, Observation, Point3d, Reconstruction};
@@ -99,23 +101,23 @@ pub fn write_bundle(model: &Reconstruction, out: &mut impl Write) -> io::Result<
     for (rank, (&id, image)) in model.images().iter().enumerate() {
         let camera = BundlerCamera::nearest(model.camera_of(id));
         cameras.insert(id, (rank, camera));
-        writeln!(out, "{} {} {}", camera.focal_px, camera.k1, camera.k2)?;
+        writeln!(out, "{} {} {}", Shortest(camera.focal_px), Shortest(camera.k1), Shortest(camera.k2))?;
         let rotation = image.cam_from_world.rotation_matrix();
         let rows = [0, 1, 2].map(|row| if row == 0 { rotation.row(row).into_owned() } else { -rotation.row(row) });
         for row in rows {
-            writeln!(out, "{} {} {}", row[0], row[1], row[2])?;
+            writeln!(out, "{} {} {}", Shortest(row[0]), Shortest(row[1]), Shortest(row[2]))?;
         }
         let t = turned(&image.cam_from_world.translation);
-        writeln!(out, "{} {} {}", t.x, t.y, t.z)?;
+        writeln!(out, "{} {} {}", Shortest(t.x), Shortest(t.y), Shortest(t.z))?;
     }
     for (_, point) in model.points() {
-        let [r, g, b] = point.color;
-        writeln!(out, "{} {} {}\n{r} {g} {b}", point.xyz.x, point.xyz.y, point.xyz.z)?;
+        let (xyz, [r, g, b]) = (point.xyz, point.color);
+        writeln!(out, "{} {} {}\n{r} {g} {b}", Shortest(xyz.x), Shortest(xyz.y), Shortest(xyz.z))?;
         write!(out, "{}", point.track.len())?;
         for seen in &point.track {
             let (rank, camera) = &cameras[&seen.image];
             let at = measured(model, camera, point, *seen);
-            write!(out, " {rank} {} {} {}", seen.keypoint.0, at.x, at.y)?;
+            write!(out, " {rank} {} {} {}", seen.keypoint.0, Shortest(at.x), Shortest(at.y))?;
         }
         writeln!(out)?;
     }

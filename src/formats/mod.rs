@@ -10,6 +10,7 @@ pub mod ply;
 pub mod poses;
 pub mod report;
 pub mod report_html;
+mod shortest;
 pub mod stored_zip;
 
 pub use error::FormatError;

@@ -1,5 +1,6 @@
-//! Zip archives of stored (not deflated) files, laid out before a byte of a file is read: the length is known beforehand, any part
-//! can be made on its own, and memory holds headers alone. (APPNOTE.TXT 6.3.10, sections 4.3 to 4.5; zip64 where it is needed.)
+//! Zip archives of stored (not deflated) files, laid out before a byte of a file is read: the length is known
+//! beforehand, any part can be made on its own, and memory holds headers alone. (APPNOTE.TXT 6.3.10, sections 4.3 to
+//! 4.5; zip64 where it is needed.)
 
 /// A file to be in an archive.
 #[derive(Clone, Debug, PartialEq, Eq)]

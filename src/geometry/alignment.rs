@@ -60,8 +60,8 @@ impl Sim3 {
     }
 }
 
-/// The least-squares similarity that maps `source[i]` to `target[i]`. None when there are fewer than three points, all points of
-/// the source coincide, or a coordinate is not finite. Points on one line leave the turn about it arbitrary.
+/// The least-squares similarity that maps `source[i]` to `target[i]`. None when there are fewer than three points, all
+/// points of the source coincide, or a coordinate is not finite. Points on one line leave the turn about it arbitrary.
 pub fn align(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Option<Sim3> {
     let n = source.len().min(target.len());
     if n < 3 {

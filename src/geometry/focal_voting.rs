@@ -34,8 +34,8 @@ pub struct FocalVotingOptions {
     pub sigma: f64,
     /// Rounds in which groups take turns.
     pub rounds: usize,
-    /// A vote of less confidence than this leaves the given focal length. (Measured with one group: 0.16 to 0.5 for five sets of
-    /// photographs, within 3 % of the truth; 0.003 for a turntable ring, whose axes all meet.)
+    /// A vote of less confidence than this leaves the given focal length. (Measured with one group: 0.16 to 0.5 for
+    /// five sets of photographs, within 3 % of the truth; 0.003 for a turntable ring, whose axes all meet.)
     pub min_confidence: f64,
 }
 

@@ -5,8 +5,8 @@ use axum::http::{HeaderMap, header};
 use super::problem::{Code, Problem};
 use crate::store::InvalidFileName;
 
-/// The file name of a part, with its folders: `filename*` (RFC 8187) when there is one, else `filename`, where a backslash stands
-/// before a quote or another backslash only.
+/// The file name of a part, with its folders: `filename*` (RFC 8187) when there is one, else `filename`, where a
+/// backslash stands before a quote or another backslash only.
 pub(super) fn file_name(headers: &HeaderMap) -> Result<String, Problem> {
     let missing = || Problem::new(Code::InvalidMultipart).detail("a part `images` has no file name");
     let value = headers.get(header::CONTENT_DISPOSITION).ok_or_else(missing)?;

@@ -95,11 +95,11 @@ impl Page {
     }
 }
 
-/// Cuts a list, which was read with one entry too many, to its page, and says whether there are more.
-pub(super) fn cut<T>(rows: &mut Vec<T>, limit: u32) -> bool {
+/// Cuts a list, which was read with one entry too many, to its page; the cursor of its last entry where there are more.
+pub(super) fn cut<T>(rows: &mut Vec<T>, limit: u32, cursor: impl FnOnce(&T) -> String) -> Option<String> {
     let more = rows.len() > limit as usize;
     rows.truncate(limit as usize);
-    more
+    rows.last().filter(|_| more).map(cursor)
 }
 
 async fn path_part<S: Send + Sync>(parts: &mut Parts, state: &S, name: &str) -> Option<String> {

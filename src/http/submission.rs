@@ -39,7 +39,8 @@ pub(super) struct Order {
     pub(super) webhook: Option<NewWebhook>,
 }
 
-/// Stores the photographs of a form in a dataset of their own and queues the job `id` on them, by what `read` takes from the form.
+/// Stores the photographs of a form in a dataset of their own and queues the job `id` on them, by what `read` takes
+/// from the form.
 pub(super) async fn submit(
     state: &AppState,
     principal: &Principal,

@@ -31,8 +31,8 @@ const BATCH_FILES: usize = 32;
 const QUEUED_CHUNKS: usize = 8;
 /// Names of left-out files that are told; all are counted.
 const TOLD_NAMES: usize = 100;
-/// Bytes between two parts, and before the first: the head of a part, and what the reader takes ahead. The reader would keep the
-/// head of a part whole, however long.
+/// Bytes between two parts, and before the first: the head of a part, and what the reader takes ahead. The reader would
+/// keep the head of a part whole, however long.
 const MAX_HEAD_BYTES: u64 = 1 << 20;
 /// Bytes of the text parts.
 const MAX_TEXT_BYTES: usize = 256 << 10;

@@ -1,5 +1,5 @@
-//! What clients of NodeODM may do with jobs beyond the rest: take a finished one back, run one again with other options, and leave
-//! tasks uncommitted.
+//! What clients of NodeODM may do with jobs beyond the rest: take a finished one back, run one again with other
+//! options, and leave tasks uncommitted.
 
 use std::time::Duration;
 
@@ -54,7 +54,8 @@ impl Jobs {
         Ok(row)
     }
 
-    /// Removes tasks of the NodeODM interface that were begun and got no photograph for `expiry`, with what they got before; how many.
+    /// Removes tasks of the NodeODM interface that were begun and got no photograph for `expiry`, with what they got
+    /// before; how many.
     ///
     /// # Errors
     /// What the store said.

@@ -9,8 +9,8 @@ use super::queue::{Jobs, state_of};
 use crate::store::StoreError;
 use crate::store::db::{datasets, jobs};
 
-/// Removes the rows of a job that does not run, and its dataset when its own upload made it and no other job uses it; gives that
-/// dataset.
+/// Removes the rows of a job that does not run, and its dataset when its own upload made it and no other job uses it;
+/// gives that dataset.
 pub(super) async fn remove_job(tx: &mut SqliteConnection, id: Uuid) -> Result<Option<Uuid>, StoreError> {
     let own: Option<Uuid> = datasets::owned_only_by(&mut *tx, id).await?.and_then(|dataset| dataset.parse().ok());
     jobs::delete(&mut *tx, id).await?;
@@ -48,8 +48,8 @@ impl Jobs {
         Ok(())
     }
 
-    /// Removes the folders of what was deleted. The deletion itself is done and must not be told as failed: what stays stands on the
-    /// list, for the next deletion or start.
+    /// Removes the folders of what was deleted. The deletion itself is done and must not be told as failed: what stays
+    /// stands on the list, for the next deletion or start.
     async fn remove_folders(&self) {
         if let Err(error) = self.store.discard_deleted().await {
             tracing::warn!(%error, "folders of what was deleted stay until the next deletion");

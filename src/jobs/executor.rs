@@ -224,8 +224,8 @@ impl Executor {
         }))
     }
 
-    /// Compares the dataset's folder with the job's list: a file without a row was never acknowledged and goes; a row without its
-    /// file ends the job.
+    /// Compares the dataset's folder with the job's list: a file without a row was never acknowledged and goes; a row
+    /// without its file ends the job.
     async fn check_input(&self, row: &JobRow) -> Result<(), ErrorView> {
         let failed = |message: String| ErrorView { stage: None, code: "input_missing".to_owned(), message };
         let check = async {

@@ -1,7 +1,7 @@
 //! Jobs: states, queue, executor, recovery.
 //!
-//! The database is the only truth. Requests change it ([`Jobs`]), one executor takes jobs out of it ([`Executor`]), and start-up
-//! puts it in order ([`recover`]); between them goes nothing but wake-ups ([`Hub`]).
+//! The database is the only truth. Requests change it ([`Jobs`]), one executor takes jobs out of it ([`Executor`]), and
+//! start-up puts it in order ([`recover`]); between them goes nothing but wake-ups ([`Hub`]).
 
 mod again;
 mod deletion;

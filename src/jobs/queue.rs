@@ -90,7 +90,8 @@ pub(super) async fn transition(
     error: Option<ErrorView>,
 ) -> Result<(), StoreError> {
     let id = job_id(row)?;
-    // Somebody may have set the clock back between two starts of the program; nothing happens to a job before what happened last.
+    // Somebody may have set the clock back between two starts of the program; nothing happens to a job before what
+    // happened last.
     let now = now_ms().max(row.created_ms).max(row.started_ms.unwrap_or(0));
     debug_assert!(state_of(row).may_become(next), "{} -> {next}", row.state);
     row.state = next.as_str().to_owned();
@@ -256,8 +257,8 @@ impl Jobs {
         Ok(())
     }
 
-    /// Whether something that makes room may be tried once more: the disk is so full that not even that could be written down, and
-    /// the ballast was there to be given up.
+    /// Whether something that makes room may be tried once more: the disk is so full that not even that could be
+    /// written down, and the ballast was there to be given up.
     pub(super) fn made_room(&self, error: &JobsError) -> bool {
         matches!(error, JobsError::Store(error) if error.is_disk_full()) && self.store.drop_ballast()
     }

@@ -80,8 +80,8 @@ impl Hold {
     }
 }
 
-/// Whether a job fits: `taken_bytes` is the memory of the running jobs, `disk_bytes` the room on the disk, `written_bytes` what an
-/// earlier attempt of the job wrote already.
+/// Whether a job fits: `taken_bytes` is the memory of the running jobs, `disk_bytes` the room on the disk,
+/// `written_bytes` what an earlier attempt of the job wrote already.
 pub fn fit(needs: &Needs, machine: &Machine, taken_bytes: u64, disk_bytes: u64, written_bytes: u64) -> Fit {
     let megabytes = |bytes: u64| bytes.div_ceil(1_000_000);
     let least = needs.memory_bytes(1);

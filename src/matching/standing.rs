@@ -1,11 +1,12 @@
-//! Matches that stand still in the frame: what is at the same pixel in both pictures while the rest has moved is no part of the scene.
-//! It is the room behind an object on a turntable before a camera on a tripod, a date or a name stamped on photographs, a spot on the
-//! sensor. Such matches agree with a camera that did not move, and where they are many they outvote the object.
+//! Matches that stand still in the frame: what is at the same pixel in both pictures while the rest has moved is no
+//! part of the scene. It is the room behind an object on a turntable before a camera on a tripod, a date or a name
+//! stamped on photographs, a spot on the sensor. Such matches agree with a camera that did not move, and where they are
+//! many they outvote the object.
 //!
-//! They are told by the density of shifts. Matches of a scene between two places have shifts that vary smoothly over the picture, so
-//! the shifts within a small radius of zero are fewer than those in the ring around it, whose area is eight times theirs if it is three
-//! times as wide. (Even along the axis that a camera turns about, where one component is zero, the ring holds twice as many.)
-//! Matches of what stands still lie within the radius alone.
+//! They are told by the density of shifts. Matches of a scene between two places have shifts that vary smoothly over
+//! the picture, so the shifts within a small radius of zero are fewer than those in the ring around it, whose area is
+//! eight times theirs if it is three times as wide. (Even along the axis that a camera turns about, where one component
+//! is zero, the ring holds twice as many.) Matches of what stands still lie within the radius alone.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,8 +20,8 @@ pub struct StandingOptions {
     pub max_shift_px: f64,
     /// Fewest matches that stand still. Below, chance may do it.
     pub min_matches: usize,
-    /// So many times as many as in the ring around them. A scene has half of what is in the ring at most, so chance reaches 2 hardly
-    /// ever; of a background nearly all is within.
+    /// So many times as many as in the ring around them. A scene has half of what is in the ring at most, so chance
+    /// reaches 2 hardly ever; of a background nearly all is within.
     pub min_contrast: f64,
 }
 
@@ -45,8 +46,8 @@ impl StandingOptions {
 /// The radius of the ring around the shifts that stand still, as a multiple of theirs.
 const RING: f64 = 3.0;
 
-/// A pair's matches that moved, in their order, by their shifts in pixels; none where none to speak of stand still. The two pictures
-/// must be of one size.
+/// A pair's matches that moved, in their order, by their shifts in pixels; none where none to speak of stand still. The
+/// two pictures must be of one size.
 pub fn moved<T: Clone>(matches: &[T], shift_px: impl Fn(&T) -> f64, options: &StandingOptions) -> Option<Vec<T>> {
     let shifts_px: Vec<f64> = matches.iter().map(shift_px).collect();
     let within = |radius_px: f64| shifts_px.iter().filter(|&&shift_px| shift_px <= radius_px).count();
@@ -63,7 +64,8 @@ mod tests {
     use super::*;
     use crate::math::Rng;
 
-    /// Shifts of `n` matches of a camera that goes round what it looks at: along x as the distance to the axis, along y by noise.
+    /// Shifts of `n` matches of a camera that goes round what it looks at: along x as the distance to the axis, along y
+    /// by noise.
     fn of_a_scene(n: usize, rng: &mut Rng) -> Vec<f64> {
         (0..n).map(|_| (rng.range(-40.0, 40.0_f64) + 0.5 * rng.normal()).hypot(0.5 * rng.normal())).collect()
     }

@@ -16,8 +16,8 @@ use crate::add_points::{
 };
 use crate::scene::{Features, ImageId, Reconstruction};
 
-/// Pairs of a unit of work. A pair of two large photographs takes 0.05 CPU seconds, so a stop costs a thread two seconds at most,
-/// and storing a unit less than a hundredth of what it took to find.
+/// Pairs of a unit of work. A pair of two large photographs takes 0.05 CPU seconds, so a stop costs a thread two
+/// seconds at most, and storing a unit less than a hundredth of what it took to find.
 const UNIT_PAIRS: usize = 32;
 
 /// What the stage is given besides the models.

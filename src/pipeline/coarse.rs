@@ -40,9 +40,10 @@ pub struct Coarse {
 
 /// Matches and reconstructs the largest scales; widens the selection while too few images are registered and keeps the best.
 ///
-/// A selection takes over the pairs among those images that the largest model so far holds firmly. Not so after the trial: where its few
-/// features leave images out, they hold the others together but weakly, too, and a street of 29 photographs went astray at
-/// such joins. And where the trial finds look-alikes, it isn't trusted to tell them apart. So a trial is taken or forgotten.
+/// A selection takes over the pairs among those images that the largest model so far holds firmly. Not so after the
+/// trial: where its few features leave images out, they hold the others together but weakly, too, and a street of 29
+/// photographs went astray at such joins. And where the trial finds look-alikes, it isn't trusted to tell them apart.
+/// So a trial is taken or forgotten.
 pub fn run(
     runner: &mut Runner<'_>,
     intake: &Intake,

@@ -221,9 +221,9 @@ impl Matcher<'_> {
         Selected { pixels, descriptors: CoarseDescriptors::new(&features.descriptors), camera }
     }
 
-    /// Does `work` for every pair, in parallel, with the selected features of both images, unless the unit of work that the pair
-    /// belongs to is `known`; a unit that is done is `kept`. Pairs are done in tiles of images that share what was read, so that
-    /// memory does not grow with the number of images. Once cancelled, what is left is left out.
+    /// Does `work` for every pair, in parallel, with the selected features of both images, unless the unit of work that
+    /// the pair belongs to is `known`; a unit that is done is `kept`. Pairs are done in tiles of images that share what
+    /// was read, so that memory does not grow with the number of images. Once cancelled, what is left is left out.
     fn for_pairs<T: Send>(
         &self,
         pairs: &[Pair],

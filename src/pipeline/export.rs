@@ -1,8 +1,11 @@
 //! The export stage: every model as COLMAP, Bundler and PLY files, then the reports.
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
 
 use super::colors::{self, Thumbnails};
 use super::features::ImageFeatures;
@@ -43,21 +46,29 @@ pub fn run(
     Ok((state, thumbnails))
 }
 
-/// Writes one model in every format.
+/// Writes what a file holds.
+type Fill<'a> = Box<dyn Fn(&mut BufWriter<File>) -> io::Result<()> + Sync + 'a>;
+
+/// Writes one model in every format, several files at a time: to print numbers takes longer than to write them.
 fn write_model(out_dir: &Path, rank: usize, model: &Reconstruction, intake: &Intake) -> Result<(), PipelineError> {
     let name = |id: ImageId| intake.name(id);
     let rank = rank.to_string();
     let [sparse, bundle, clouds] = ["sparse", "bundle", "ply"].map(|format| out_dir.join(format).join(&rank));
-    write(&sparse.join("cameras.bin"), |out| colmap::write_cameras_bin(model, out))?;
-    write(&sparse.join("images.bin"), |out| colmap::write_images_bin(model, name, out))?;
-    write(&sparse.join("points3D.bin"), |out| colmap::write_points3d_bin(model, out))?;
-    write(&sparse.join("cameras.txt"), |out| colmap::write_cameras_txt(model, out))?;
-    write(&sparse.join("images.txt"), |out| colmap::write_images_txt(model, name, out))?;
-    write(&sparse.join("points3D.txt"), |out| colmap::write_points3d_txt(model, out))?;
-    write(&bundle.join("bundle.out"), |out| bundler::write_bundle(model, out))?;
-    write(&bundle.join("list.txt"), |out| bundler::write_list(model, name, out))?;
-    write(&clouds.join("points.ply"), |out| ply::write_points(model, out))?;
-    write(&clouds.join("cameras.ply"), |out| ply::write_cameras(model, out))
+    // The longest first.
+    let files: [(PathBuf, Fill<'_>); 10] = [
+        (sparse.join("images.txt"), Box::new(|out| colmap::write_images_txt(model, name, out))),
+        (sparse.join("points3D.txt"), Box::new(|out| colmap::write_points3d_txt(model, out))),
+        (bundle.join("bundle.out"), Box::new(|out| bundler::write_bundle(model, out))),
+        (sparse.join("points3D.bin"), Box::new(|out| colmap::write_points3d_bin(model, out))),
+        (sparse.join("images.bin"), Box::new(|out| colmap::write_images_bin(model, name, out))),
+        (clouds.join("points.ply"), Box::new(|out| ply::write_points(model, out))),
+        (clouds.join("cameras.ply"), Box::new(|out| ply::write_cameras(model, out))),
+        (sparse.join("cameras.bin"), Box::new(|out| colmap::write_cameras_bin(model, out))),
+        (sparse.join("cameras.txt"), Box::new(|out| colmap::write_cameras_txt(model, out))),
+        (bundle.join("list.txt"), Box::new(|out| bundler::write_list(model, name, out))),
+    ];
+    let written: Vec<_> = files.par_iter().with_max_len(1).map(|(path, fill)| write(path, fill)).collect();
+    written.into_iter().collect()
 }
 
 /// Writes `report.json` and `report.html`.
@@ -78,15 +89,12 @@ pub fn write_reports(
 }
 
 /// Writes a file through a buffer, making its folder.
-fn write(
-    path: &PathBuf,
-    fill: impl FnOnce(&mut BufWriter<std::fs::File>) -> io::Result<()>,
-) -> Result<(), PipelineError> {
+fn write(path: &PathBuf, fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> Result<(), PipelineError> {
     let written = (|| {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder)?;
         }
-        let mut out = BufWriter::new(std::fs::File::create(path)?);
+        let mut out = BufWriter::new(File::create(path)?);
         fill(&mut out)?;
         out.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all()
     })();

@@ -145,7 +145,8 @@ impl<'a> StoredFeatures<'a> {
         Self { store, keys: usable.map(|(&id, image)| (id, image.key.clone())).collect(), lost: Mutex::default() }
     }
 
-    /// The `limit` features of largest scale, or all; empty when they can't be read back ([`StoredFeatures::check`] then tells).
+    /// The `limit` features of largest scale, or all; empty when they can't be read back ([`StoredFeatures::check`]
+    /// then tells).
     pub fn read(&self, id: ImageId, limit: Option<usize>) -> Features {
         let Some(key) = self.keys.get(&id) else { return Features::default() };
         let features =

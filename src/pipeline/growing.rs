@@ -8,8 +8,8 @@ use super::PipelineError;
 use super::units::Units;
 use crate::coarse::{Checkpoint, Checkpoints};
 
-/// A model is kept once growing has taken so many times what keeping it took last, so that keeping costs 2 % at most, however large
-/// the model and slow the disk.
+/// A model is kept once growing has taken so many times what keeping it took last, so that keeping costs 2 % at most,
+/// however large the model and slow the disk.
 const WORK_PER_KEEPING: u32 = 50;
 
 /// Keeps the models of one `coarse_model`, each as it stood last.

@@ -1,7 +1,8 @@
 //! Masks: pictures that say which parts of a photograph to ignore, such as the background of an object on a turntable.
 //!
-//! The mask of `sub/a.jpg` is `masks/sub/a.png` or `masks/sub/a.jpg.png` in the input folder. It has the photograph's shape, at any
-//! resolution; where it is zero no feature is kept. A picture under `masks/` that belongs to no photograph is a photograph itself.
+//! The mask of `sub/a.jpg` is `masks/sub/a.png` or `masks/sub/a.jpg.png` in the input folder. It has the photograph's
+//! shape, at any resolution; where it is zero no feature is kept. A picture under `masks/` that belongs to no
+//! photograph is a photograph itself.
 
 use std::collections::BTreeMap;
 use std::path::Path;

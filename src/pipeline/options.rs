@@ -162,9 +162,9 @@ pub struct RefineOptions {
     pub min_triangulation_angle_deg: f64,
     /// Which points of two sightings are taken for wrong matches.
     pub strays: StrayOptions,
-    /// The adjustment. Robust by default: guided matches hold a few wrong ones within the limits. Measured against least
-    /// squares: temple ring AUC@1 80 for 78, the surveyed fountain unchanged. Reweighting nears its end in many small steps: at a
-    /// tolerance of 1e-3 it takes a quarter of the time of 1e-6 and the poses are as good.
+    /// The adjustment. Robust by default: guided matches hold a few wrong ones within the limits. Measured against
+    /// least squares: temple ring AUC@1 80 for 78, the surveyed fountain unchanged. Reweighting nears its end in many
+    /// small steps: at a tolerance of 1e-3 it takes a quarter of the time of 1e-6 and the poses are as good.
     pub bundle: BundleOptions,
 }
 

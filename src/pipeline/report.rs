@@ -65,7 +65,8 @@ pub fn principal_point_notes(models: &[ModelState]) -> Vec<String> {
     notes.collect()
 }
 
-/// Tells of focal lengths, not from EXIF, that hardly any lens has: the photographs left them open, and the shape of the model with them.
+/// Tells of focal lengths, not from EXIF, that hardly any lens has: the photographs left them open, and the shape of
+/// the model with them.
 pub fn focal_notes(models: &[ModelState], plausible: &FocalVotingOptions) -> Vec<String> {
     let told = used_cameras(models).filter(|(_, camera)| camera.focal_source.is_told_by_photographs());
     let notes = told.filter_map(|(at, camera)| {

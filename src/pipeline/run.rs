@@ -29,8 +29,8 @@ pub struct RunPaths {
     pub work_dir: PathBuf,
 }
 
-/// Bytes of features kept in memory at most while cameras are added; more are read back from disk when needed. Measured on 128 images
-/// of 17,000 features: 64 MiB take no more CPU time than 768, and 194 MB less at the peak.
+/// Bytes of features kept in memory at most while cameras are added; more are read back from disk when needed. Measured
+/// on 128 images of 17,000 features: 64 MiB take no more CPU time than 768, and 194 MB less at the peak.
 pub(super) const FEATURE_CACHE_BYTES: usize = 64 << 20;
 
 /// Runs the pipeline on its own pool of `context.threads` threads and writes every output. That no model was found is not an

@@ -1,8 +1,8 @@
 //! Runs stages: re-uses the result of an earlier run with the same inputs, measures, tells progress, keeps the account.
 //!
 //! A stage's result is stored under the hash of everything that decides it: the key of the stage before, the options it
-//! reads, the seed. So a run that was stopped at any moment goes on from its last finished stage (and within it from its finished
-//! [units of work](super::units)), and one with other options re-does only what they touch.
+//! reads, the seed. So a run that was stopped at any moment goes on from its last finished stage (and within it from
+//! its finished [units of work](super::units)), and one with other options re-does only what they touch.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -21,7 +21,7 @@ use crate::store::ArtifactStore;
 pub type Counts = BTreeMap<String, f64>;
 
 /// Changes whenever stored stage results of an earlier build must not be re-used.
-const FORMAT_VERSION: u32 = 5;
+const FORMAT_VERSION: u32 = 6;
 
 /// The key a stage's result is stored under.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -175,8 +175,8 @@ impl<'a> Runner<'a> {
     }
 }
 
-/// The bytes of a stage's result or of a unit of its work, in a block of just their size: a block that grows takes twice as much
-/// for models of tens of megabytes.
+/// The bytes of a stage's result or of a unit of its work, in a block of just their size: a block that grows takes
+/// twice as much for models of tens of megabytes.
 pub(super) fn to_bytes<T: Serialize + ?Sized>(value: &T) -> Vec<u8> {
     let size = postcard::serialize_with_flavor(value, postcard::ser_flavors::Size::default());
     let bytes = Vec::with_capacity(size.expect("plain data serialises"));

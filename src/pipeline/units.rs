@@ -1,5 +1,5 @@
-//! Finished units of work of a stage: kept while the stage goes on, so that a run that is stopped at any moment goes on from them,
-//! and removed once the stage's own result is stored.
+//! Finished units of work of a stage: kept while the stage goes on, so that a run that is stopped at any moment goes on
+//! from them, and removed once the stage's own result is stored.
 //!
 //! A unit's result is kept under the key of its stage, which stands for everything that decides it besides the unit itself
 //! (stages before, options, seed), and the hash of the unit's own description. How work is cut into units decides what a stop
@@ -38,7 +38,8 @@ impl<'a> Units<'a> {
         Ok(bytes.and_then(|bytes| postcard::from_bytes(&bytes).ok()))
     }
 
-    /// Of the units that `cut` gives, each part of the work of the model `rank`: what an earlier run found for some, and the others.
+    /// Of the units that `cut` gives, each part of the work of the model `rank`: what an earlier run found for some,
+    /// and the others.
     ///
     /// # Errors
     /// As [`Units::known`]'s.

@@ -35,8 +35,8 @@ pub trait Estimator<const SAMPLE_SIZE: usize> {
     fn refine(&self, model: &Self::Model, inliers: &[usize], threshold_sq: f64) -> Option<Self::Model>;
 }
 
-/// The most trials that options may ask for. A loop is never left in the middle, so this bounds what a cancelled run still does: some
-/// seconds.
+/// The most trials that options may ask for. A loop is never left in the middle, so this bounds what a cancelled run
+/// still does: some seconds.
 const MOST_TRIALS: usize = 100_000;
 
 /// When to stop.

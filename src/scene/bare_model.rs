@@ -36,7 +36,8 @@ impl<'a> BareModel<'a> {
         self.images.iter().map(|&(id, ..)| id)
     }
 
-    /// The whole model, with the positions that `keypoints` gives for each image; none where they are not those it was made with.
+    /// The whole model, with the positions that `keypoints` gives for each image; none where they are not those it was
+    /// made with.
     pub fn complete(self, keypoints: &dyn Fn(ImageId) -> Option<Arc<[Pixel]>>) -> Option<Reconstruction> {
         let mut model = Reconstruction::new(self.cameras.into_owned());
         model.apart = self.apart.into_owned();

@@ -58,8 +58,8 @@ impl Appender {
 }
 
 impl Store {
-    /// Opens the file of an upload behind its first `offset` bytes, whose hash may be given to go on with it; what lies there goes.
-    /// Blocking.
+    /// Opens the file of an upload behind its first `offset` bytes, whose hash may be given to go on with it; what lies
+    /// there goes. Blocking.
     ///
     /// # Errors
     /// What the system said.

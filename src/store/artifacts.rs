@@ -1,7 +1,8 @@
 //! Results of units of work as content-addressed files: what a run keeps in its work folder to go on after a crash.
 //!
-//! A key names a value for good (it is made from the hash of everything the value depends on), so a value is written once
-//! and never changed; only what is kept of work that still goes on is replaced, as a whole, by what it has become. Each file starts with a header
+//! A key names a value for good (it is made from the hash of everything the value depends on), so a value is written
+//! once and never changed; only what is kept of work that still goes on is replaced, as a whole, by what it has become.
+//! Each file starts with a header
 //!
 //! ```text
 //! 0..8    magic and version, "MSFMART1"

@@ -1,9 +1,9 @@
 //! A copy of a data directory whose service may run.
 //!
-//! First the database as it is at one moment, then the files it speaks of, which never change under their names. The service leaves
-//! the files of what is deleted meanwhile in place. When one is gone all the same, as that of an upload that was completed, the copy
-//! starts over with a new moment, and takes what it has copied already.
-//! Results of stages are left out: they can be computed again.
+//! First the database as it is at one moment, then the files it speaks of, which never change under their names. The
+//! service leaves the files of what is deleted meanwhile in place. When one is gone all the same, as that of an upload
+//! that was completed, the copy starts over with a new moment, and takes what it has copied already. Results of stages
+//! are left out: they can be computed again.
 
 use std::fs::File;
 use std::io::{self, Read};

@@ -1,7 +1,8 @@
 //! Who puts what under which path: one request at a time per path of a dataset.
 //!
-//! A file enters its dataset before its row is written, so for a while the database does not know of it. Who holds the claim on a
-//! path may therefore rename a file to it when the database has no row: whatever lies there is a remainder of a crash.
+//! A file enters its dataset before its row is written, so for a while the database does not know of it. Who holds the
+//! claim on a path may therefore rename a file to it when the database has no row: whatever lies there is a remainder
+//! of a crash.
 
 use std::collections::{BTreeSet, HashSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -1,6 +1,7 @@
 //! Whether a data directory is whole: the database in itself, and the files that it speaks of.
 //!
-//! Nothing is ever deleted here. What belongs to nobody is moved to `quarantine/`, from where the service removes it after a week.
+//! Nothing is ever deleted here. What belongs to nobody is moved to `quarantine/`, from where the service removes it
+//! after a week.
 
 use std::collections::BTreeSet;
 use std::fs::File;

@@ -15,8 +15,9 @@ const MOST: usize = 10_000;
 pub(super) struct DurableFolders(Mutex<HashSet<PathBuf>>);
 
 impl DurableFolders {
-    /// Makes `folder`, at or below `root`, with its ancestors. That one is there does not mean that it is durable: another request
-    /// or another process may have made it just now. So whoever comes first syncs it, and the others wait. Blocking.
+    /// Makes `folder`, at or below `root`, with its ancestors. That one is there does not mean that it is durable:
+    /// another request or another process may have made it just now. So whoever comes first syncs it, and the others
+    /// wait. Blocking.
     ///
     /// # Errors
     /// What the system said.

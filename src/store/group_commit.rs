@@ -1,12 +1,12 @@
 //! Many small writes made durable together.
 //!
 //! A commit waits for the disk, and one that waits can take others along: requests hand their writes to one task, which
-//! makes all of them in one transaction, commits it and tells each. While it waits for the disk the next ones gather, so the more
-//! requests there are the fewer syncs each costs, and a lone one waits for nobody. Files and folders that a write speaks of are durable
-//! before it is handed over: each request syncs its own, side by side with the others.
-//! A transaction that fails, or in which one write refuses, is undone and taken apart: whoever refused is asked alone and the others
-//! together once more, and when that fails too, one by one. So everybody learns of their own failure and of no other, and what is
-//! rare costs those who meet it; savepoints would cost everybody.
+//! makes all of them in one transaction, commits it and tells each. While it waits for the disk the next ones gather,
+//! so the more requests there are the fewer syncs each costs, and a lone one waits for nobody. Files and folders that a
+//! write speaks of are durable before it is handed over: each request syncs its own, side by side with the others. A
+//! transaction that fails, or in which one write refuses, is undone and taken apart: whoever refused is asked alone and
+//! the others together once more, and when that fails too, one by one. So everybody learns of their own failure and of
+//! no other, and what is rare costs those who meet it; savepoints would cost everybody.
 
 use std::io;
 use std::panic::AssertUnwindSafe;

@@ -149,9 +149,9 @@ impl Store {
         })
     }
 
-    /// Removes the folders of deleted jobs and datasets. What can't be removed stays on the list for the next time and is told to
-    /// the log: it costs space, no more. One after the other: at once, each would remove what is on the others' lists, and a folder could
-    /// leave the list before whoever moved it away has made that durable.
+    /// Removes the folders of deleted jobs and datasets. What can't be removed stays on the list for the next time and
+    /// is told to the log: it costs space, no more. One after the other: at once, each would remove what is on the
+    /// others' lists, and a folder could leave the list before whoever moved it away has made that durable.
     ///
     /// # Errors
     /// What SQLite said.

@@ -54,8 +54,8 @@ struct Sorted {
 }
 
 impl Store {
-    /// Puts staged files into a dataset, durably, also when whoever asked leaves meanwhile. Stops at a path that is stored with other
-    /// bytes; what came before it stays.
+    /// Puts staged files into a dataset, durably, also when whoever asked leaves meanwhile. Stops at a path that is
+    /// stored with other bytes; what came before it stays.
     ///
     /// # Errors
     /// [`StoreError::FileConflict`], [`StoreError::DatasetInUse`] while a job on it is queued or running,

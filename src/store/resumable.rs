@@ -187,8 +187,9 @@ impl Store {
         Ok(())
     }
 
-    /// Puts a complete upload, whose bytes are durable, into its dataset and writes its row. Where the caller does not know the SHA-256
-    /// of its bytes, they are read. Asking again is no error; for a partial or incomplete one nothing happens.
+    /// Puts a complete upload, whose bytes are durable, into its dataset and writes its row. Where the caller does not
+    /// know the SHA-256 of its bytes, they are read. Asking again is no error; for a partial or incomplete one nothing
+    /// happens.
     ///
     /// # Errors
     /// [`UploadError::Conflict`], after which the upload is gone; a dataset that takes nothing now; what the store said.

@@ -63,7 +63,8 @@ impl Reservations {
     }
 }
 
-/// Bytes that open uploads have announced and not sent yet. What the database said last is not too little until more is announced.
+/// Bytes that open uploads have announced and not sent yet. What the database said last is not too little until more is
+/// announced.
 #[derive(Debug, Default)]
 pub(super) struct Promised {
     /// How often they grew.

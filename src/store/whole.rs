@@ -1,9 +1,9 @@
 //! Photographs that come whole, with the request that makes their upload.
 //!
-//! Nothing of them is on the disk before, so it all happens in one go: one blocking call writes the bytes under a temporary name, syncs
-//! them, gives them their name in the dataset and syncs the folder; then photograph and upload are noted in one request to SQLite,
-//! committed together with those of other requests; then the sender is answered. A crash in between leaves at most a file without a row,
-//! which nobody was told about.
+//! Nothing of them is on the disk before, so it all happens in one go: one blocking call writes the bytes under a
+//! temporary name, syncs them, gives them their name in the dataset and syncs the folder; then photograph and upload
+//! are noted in one request to SQLite, committed together with those of other requests; then the sender is answered. A
+//! crash in between leaves at most a file without a row, which nobody was told about.
 
 use std::io;
 use std::path::PathBuf;
@@ -28,7 +28,8 @@ enum Written {
 }
 
 impl Store {
-    /// Adds an upload whose bytes are all there, in `pieces`, as a photograph of its dataset; they are dropped as soon as they are written.
+    /// Adds an upload whose bytes are all there, in `pieces`, as a photograph of its dataset; they are dropped as soon
+    /// as they are written.
     ///
     /// # Errors
     /// [`UploadError::Conflict`], a dataset that takes nothing now, or what the store said; there is no upload then.

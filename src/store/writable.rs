@@ -1,8 +1,8 @@
 //! Datasets that take photographs now, as far as that is known without asking the database.
 //!
-//! Which datasets there are and which of them jobs use changes in transactions of their own alone, never in the group commits of
-//! photographs and uploads. So what the database said once holds until the next such transaction: of many photographs in a row only the
-//! first asks. Whoever writes the row asks again, within its transaction.
+//! Which datasets there are and which of them jobs use changes in transactions of their own alone, never in the group
+//! commits of photographs and uploads. So what the database said once holds until the next such transaction: of many
+//! photographs in a row only the first asks. Whoever writes the row asks again, within its transaction.
 
 use std::collections::HashSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -1,6 +1,6 @@
-//! A run that is stopped in the middle of a stage, by a cancel or by SIGKILL, goes on from its last finished units of work: what was
-//! done is not done again, by count, and the outputs are, byte for byte, those of a run that nobody stopped, whatever the number of
-//! threads of each of its lives.
+//! A run that is stopped in the middle of a stage, by a cancel or by SIGKILL, goes on from its last finished units of
+//! work: what was done is not done again, by count, and the outputs are, byte for byte, those of a run that nobody
+//! stopped, whatever the number of threads of each of its lives.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -47,8 +47,8 @@ fn make_scene(folder: &Path, images: usize) {
     assert!(made.output().unwrap().status.success());
 }
 
-/// Options with which a few features make the coarse model, so that most of the work is left to the later stages. Photographs that
-/// see less than `min_pose_inliers` of its points are not in it.
+/// Options with which a few features make the coarse model, so that most of the work is left to the later stages.
+/// Photographs that see less than `min_pose_inliers` of its points are not in it.
 fn options(min_pose_inliers: usize) -> Value {
     let mapper = json!({"min_pose_inliers": min_pose_inliers, "min_pose_inliers_relaxed": min_pose_inliers});
     let selection = json!({"eta_percent": 1, "all_below": 0, "min_features": 300});

@@ -1,5 +1,5 @@
-//! Sets that leave a two-view geometry undetermined or mislead it: views turned on the spot, a flat scene, and a background that
-//! stands still in the frame.
+//! Sets that leave a two-view geometry undetermined or mislead it: views turned on the spot, a flat scene, and a
+//! background that stands still in the frame.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -163,8 +163,8 @@ fn worst_distance_error(found: &BTreeMap<String, Vector3<f64>>, truth: &BTreeMap
     found.iter().zip(&truth).map(|(a, b)| (scale * a - b).abs()).fold(0.0, f64::max)
 }
 
-/// As on a turntable before a camera on a tripod: the middle of each picture shows the object from another side, and the same room
-/// is around it in all, with more matches than the object has.
+/// As on a turntable before a camera on a tripod: the middle of each picture shows the object from another side, and
+/// the same room is around it in all, with more matches than the object has.
 #[test]
 fn a_background_that_stands_still_is_left_out() {
     let folder = tempfile::tempdir().unwrap();

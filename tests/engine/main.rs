@@ -1,4 +1,5 @@
-//! The engine as programs and people use it: the binary's commands, runs that are stopped and go on, and the files it writes and reads.
+//! The engine as programs and people use it: the binary's commands, runs that are stopped and go on, and the files it
+//! writes and reads.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,8 +1,8 @@
 //! Clients that are slow on purpose: heads and bodies that trickle in, answers that nobody reads, more connections than places.
 //! They must be cut in the stated time, and everybody else must not notice.
 //!
-//! `MULTISTAGE_SLOW_CLIENTS=full cargo test --locked --test measured slow_clients -- --nocapture` does it at full size, with the limits of the
-//! program: 1000 heads of one byte per 10 seconds and 200 bodies of one byte a second.
+//! `MULTISTAGE_SLOW_CLIENTS=full cargo test --locked --test measured slow_clients -- --nocapture` does it at full size,
+//! with the limits of the program: 1000 heads of one byte per 10 seconds and 200 bodies of one byte a second.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};

@@ -1,5 +1,6 @@
-//! Tokens are given away neither by the log nor by the time of an answer, which tells nothing about how near a guess was: guesses whose
-//! hash agrees with the stored one in all but its last byte are timed against guesses that agree in nothing, by Welch's t-test.
+//! Tokens are given away neither by the log nor by the time of an answer, which tells nothing about how near a guess
+//! was: guesses whose hash agrees with the stored one in all but its last byte are timed against guesses that agree in
+//! nothing, by Welch's t-test.
 //!
 //! `MULTISTAGE_TIMINGS=100000 cargo test --locked --test measured tokens -- --nocapture` makes 100,000 trials.
 

@@ -1,5 +1,5 @@
-//! Somebody sets the system's clock a day forward and back under the running program, and between two starts: nothing expires early,
-//! and no duration is negative.
+//! Somebody sets the system's clock a day forward and back under the running program, and between two starts: nothing
+//! expires early, and no duration is negative.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;

@@ -1,7 +1,8 @@
-//! Holds the running program to `openapi.yaml` by programs of others: schemathesis makes requests of the document, good and bad, and
-//! checks every answer; a client that is generated from it reconstructs.
+//! Holds the running program to `openapi.yaml` by programs of others: schemathesis makes requests of the document, good
+//! and bad, and checks every answer; a client that is generated from it reconstructs.
 //!
-//! `MULTISTAGE_EXAMPLES=500 cargo test --locked --test program contract -- --nocapture` tries 500 requests of every kind per operation.
+//! `MULTISTAGE_EXAMPLES=500 cargo test --locked --test program contract -- --nocapture` tries 500 requests of every
+//! kind per operation.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

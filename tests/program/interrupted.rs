@@ -1,5 +1,5 @@
-//! A job that ends the process each time it runs, as one that is killed for its memory, must not do so for ever: the real program is
-//! killed whenever the job is at the same stage, until it gives the job up, and then serves others.
+//! A job that ends the process each time it runs, as one that is killed for its memory, must not do so for ever: the
+//! real program is killed whenever the job is at the same stage, until it gives the job up, and then serves others.
 
 use std::time::{Duration, Instant};
 

@@ -1,6 +1,6 @@
-//! The real program, killed with SIGKILL at random moments while a client uploads, queues, waits, downloads and deletes. What was
-//! acknowledged must be there after every start, no job may be lost, doubled or stuck, and the models must be, byte for byte,
-//! those of a run that nobody disturbed.
+//! The real program, killed with SIGKILL at random moments while a client uploads, queues, waits, downloads and
+//! deletes. What was acknowledged must be there after every start, no job may be lost, doubled or stuck, and the models
+//! must be, byte for byte, those of a run that nobody disturbed.
 //!
 //! `MULTISTAGE_KILLS=300 cargo test --locked --test program kills -- --nocapture` kills 300 times.
 

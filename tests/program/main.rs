@@ -1,5 +1,5 @@
-//! The real program, and what happens to it: it is started and stopped, cancelled and killed, loses power and its clock, its disk is
-//! full or broken, and programs of others hold it to its contract.
+//! The real program, and what happens to it: it is started and stopped, cancelled and killed, loses power and its
+//! clock, its disk is full or broken, and programs of others hold it to its contract.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,6 +1,6 @@
-//! Power cuts. The real program works under strace, which records every write, sync and rename; then the record is played back to
-//! many moments, each time onto a disk that has what was synced and of the rest nothing, or any part. The program starts on what is
-//! left, and whatever it had acknowledged until that moment must be there.
+//! Power cuts. The real program works under strace, which records every write, sync and rename; then the record is
+//! played back to many moments, each time onto a disk that has what was synced and of the rest nothing, or any part.
+//! The program starts on what is left, and whatever it had acknowledged until that moment must be there.
 //!
 //! `MULTISTAGE_POWER_CUTS=100 cargo test --locked --test program power_loss -- --nocapture` cuts 100 times. It needs strace.
 

@@ -1,6 +1,7 @@
-//! Over bad lines senders send again what arrived long ago. Every photograph of a set is sent three times, in random order and several
-//! at once, while three of ten senders leave before they read the answer; and again until it was acknowledged. The dataset must then
-//! hold the set, byte for byte, and nothing twice: through tus, as parts of forms, and in archives.
+//! Over bad lines senders send again what arrived long ago. Every photograph of a set is sent three times, in random
+//! order and several at once, while three of ten senders leave before they read the answer; and again until it was
+//! acknowledged. The dataset must then hold the set, byte for byte, and nothing twice: through tus, as parts of forms,
+//! and in archives.
 
 use std::collections::BTreeMap;
 use std::io::{Cursor, Write};

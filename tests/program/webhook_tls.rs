@@ -1,5 +1,5 @@
-//! Webhooks over TLS: the real program tells an https receiver whose authority it was told to trust (`--webhook-ca`), and nothing to
-//! one whose certificate is of an unknown authority or of another host.
+//! Webhooks over TLS: the real program tells an https receiver whose authority it was told to trust (`--webhook-ca`),
+//! and nothing to one whose certificate is of an unknown authority or of another host.
 
 use std::net::SocketAddr;
 use std::path::Path;

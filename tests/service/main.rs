@@ -1,5 +1,5 @@
-//! The HTTP interface on a real listener, in the tests' own process and with a quick engine: request by request, one file per resource;
-//! its contract, the clients that others wrote, and what nobody in good faith sends.
+//! The HTTP interface on a real listener, in the tests' own process and with a quick engine: request by request, one
+//! file per resource; its contract, the clients that others wrote, and what nobody in good faith sends.
 
 #![allow(clippy::unwrap_used)]
 

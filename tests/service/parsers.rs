@@ -1,7 +1,8 @@
 //! Feeds everything that reads bytes of others with mangled files: bytes changed, cut, doubled and put together from two.
 //!
-//! `MULTISTAGE_CORPUS=FOLDER cargo test --locked --test service parsers::corpus` feeds every file of a folder to every reader, such as what a
-//! fuzzer found (see `fuzz/README.md`); with `MULTISTAGE_SEEDS=FOLDER` the whole files are written there, for a fuzzer to begin with.
+//! `MULTISTAGE_CORPUS=FOLDER cargo test --locked --test service parsers::corpus` feeds every file of a folder to every
+//! reader, such as what a fuzzer found (see `fuzz/README.md`); with `MULTISTAGE_SEEDS=FOLDER` the whole files are
+//! written there, for a fuzzer to begin with.
 
 mod targets;
 

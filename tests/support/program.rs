@@ -1,5 +1,5 @@
-//! The real program on a data directory of its own, to be killed. Unless it is told otherwise, it listens on a free port of this machine, has
-//! two threads and logs errors alone.
+//! The real program on a data directory of its own, to be killed. Unless it is told otherwise, it listens on a free
+//! port of this machine, has two threads and logs errors alone.
 #![allow(dead_code, reason = "every test binary uses its own part")]
 
 use std::io::{BufRead, BufReader};

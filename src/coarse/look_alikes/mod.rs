@@ -4,20 +4,21 @@
 //!
 //! Three steps, each cheaper than matching by far:
 //!
-//! 1. **Strength** ([`strength`]). Each pair is rated by how much of what its photographs show is matched: of the places that
-//!    hold any feature known from some other photograph, the share (intersection over union) with a match of this pair near by,
-//!    the rarer what they hold, the more they weigh. Photographs of one place taken near each other match all over; those of two
-//!    copies match on the copy alone, however many matches that gives: their surroundings are missing correspondences (Zach,
-//!    Irschara, Bischof, CVPR 2008).
+//! 1. **Strength** ([`strength`]). Each pair is rated by how much of what its photographs show is matched: of the
+//!    places that hold any feature known from some other photograph, the share (intersection over union) with a match
+//!    of this pair near by, the rarer what they hold, the more they weigh. Photographs of one place taken near each
+//!    other match all over; those of two copies match on the copy alone, however many matches that gives: their
+//!    surroundings are missing correspondences (Zach, Irschara, Bischof, CVPR 2008).
 //! 2. **Skeleton** ([`skeleton`]). From the strongest pair on, pairs are taken while the tracks they grow agree. A pair whose
 //!    images stronger pairs connect already, and whose matches the tracks of these do not know, is put off: either the chain
 //!    came back to the same place or the two places look alike.
 //! 3. **Judgement** ([`judgement`]). A model of the skeleton alone tells which: it has a point for either keypoint of a match.
 //!    Where the two points of most matches lie apart, the pair is cut; where they coincide it closes a loop and is kept.
 //!
-//! Going from strong to weak and doubting only what a stronger chain contradicts follows the path networks of Yan, Yang,
-//! Zhang, Xiao, "Distinguishing the Indistinguishable", CVPR 2017, and the maximum spanning trees of Jiang, Tan, Cheong, "Seeing
-//! Double Without Confusion", CVPR 2012. Nothing depends on the order of the photographs or on when they were taken.
+//! Going from strong to weak and doubting only what a stronger chain contradicts follows the path networks of Yan,
+//! Yang, Zhang, Xiao, "Distinguishing the Indistinguishable", CVPR 2017, and the maximum spanning trees of Jiang, Tan,
+//! Cheong, "Seeing Double Without Confusion", CVPR 2012. Nothing depends on the order of the photographs or on when
+//! they were taken.
 
 mod judgement;
 mod options;

@@ -12,9 +12,10 @@ pub struct LookAlikeOptions {
     /// size around it. More follow small surroundings better; with too many, a feature lost by chance looks like missing
     /// surroundings. Measured on random subsets of three sets of look-alikes: 8 to 12 do alike, more do worse.
     pub grid_cells: u32,
-    /// A pair whose images stronger pairs connect already is taken without doubt when at least this share of its matches joins keypoints that the stronger pairs hold
-    /// for one point too, of those whose keypoints both are in tracks of the stronger pairs. Raising it doubts more pairs; those
-    /// that are true are kept all the same, for the price of a second coarse model.
+    /// A pair whose images stronger pairs connect already is taken without doubt when at least this share of its
+    /// matches joins keypoints that the stronger pairs hold for one point too, of those whose keypoints both are in
+    /// tracks of the stronger pairs. Raising it doubts more pairs; those that are true are kept all the same, for the
+    /// price of a second coarse model.
     pub agreeing_share: f64,
     /// An undoubted pair may join two tracks into one when its strength is at least this share of the weakest link of the
     /// strongest chain between its images; weaker ones only extend tracks.

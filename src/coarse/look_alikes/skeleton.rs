@@ -22,10 +22,10 @@ pub(super) struct Suspect {
     pub(super) chain_strength: f64,
 }
 
-/// Takes pairs from the strongest to the weakest (ties by matches, then images) and puts off those that a stronger chain and
-/// its tracks contradict. Wide baselines lose features on the way and so agree only in part; a set is taken for free of
-/// look-alikes, and nothing is put off, unless some pair agrees nearly not at all. `keep_going` is asked for every pair; once it
-/// says no, nothing is found.
+/// Takes pairs from the strongest to the weakest (ties by matches, then images) and puts off those that a stronger
+/// chain and its tracks contradict. Wide baselines lose features on the way and so agree only in part; a set is taken
+/// for free of look-alikes, and nothing is put off, unless some pair agrees nearly not at all. `keep_going` is asked
+/// for every pair; once it says no, nothing is found.
 pub(super) fn suspects(input: &MapperInput, options: &LookAlikeOptions, keep_going: &KeepGoing) -> Vec<Suspect> {
     let Some(strengths) = strengths(input, options, keep_going) else { return Vec::new() };
     let mut order: Vec<_> = input.graph.pairs.iter().map(|(&images, geometry)| (images, geometry)).collect();

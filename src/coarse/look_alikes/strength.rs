@@ -15,16 +15,17 @@ const WINDOW_CELLS: usize = 3;
 /// The strength of every pair, 0 to 1: the geometric mean of two intersections over unions of what its photographs show, one
 /// with all of it, one with what should be in both by the pair's own matches.
 ///
-/// What a photograph shows are the cells of a fine grid that hold a feature matched with any other photograph; of these the pair
-/// leaves over, in each photograph, those without a match of its own in the window of three by three cells around them. Cells
-/// instead of features: a densely textured copy must not outweigh sparse surroundings. For the same reason a cell weighs the
-/// inverse of the number of cells shown in its window. Windows that overlap instead of a coarse grid of their size: with that,
-/// the order of the pairs changed with where its lines happened to fall (below).
+/// What a photograph shows are the cells of a fine grid that hold a feature matched with any other photograph; of these
+/// the pair leaves over, in each photograph, those without a match of its own in the window of three by three cells
+/// around them. Cells instead of features: a densely textured copy must not outweigh sparse surroundings. For the same
+/// reason a cell weighs the inverse of the number of cells shown in its window. Windows that overlap instead of a
+/// coarse grid of their size: with that, the order of the pairs changed with where its lines happened to fall (below).
 ///
-/// A cell weighs, further, the inverse of the number of pairs that match the commonest feature of its window. What is seen in many
-/// photographs tells little of where one was taken: a front that stands three times in a street is matched in the photographs of
-/// all three, the bin before one of them in a few neighbours alone. Unweighed, two photographs filled by copies of the front
-/// match better than two of one copy taken a step apart. (The weight of words in text retrieval: Sparck Jones 1972.)
+/// A cell weighs, further, the inverse of the number of pairs that match the commonest feature of its window. What is
+/// seen in many photographs tells little of where one was taken: a front that stands three times in a street is matched
+/// in the photographs of all three, the bin before one of them in a few neighbours alone. Unweighed, two photographs
+/// filled by copies of the front match better than two of one copy taken a step apart. (The weight of words in text
+/// retrieval: Sparck Jones 1972.)
 ///
 /// What should be in both: cells that the affine map of the matches takes into the other photograph. A step aside moves
 /// some of the scene out of the frame, which says nothing against a pair; surroundings that ought to be there and are not do
@@ -77,7 +78,7 @@ impl Grid {
     /// With windows of which so many fit along the longer side.
     fn new(size_px: Vector2<f64>, grid_cells: u32) -> Self {
         let cell_px = size_px.max() / (f64::from(grid_cells) * WINDOW_CELLS as f64);
-        let cells = |length_px: f64| ((length_px / cell_px).ceil() as usize).max(1);
+        let cells = |length_px: f64| (length_px / cell_px).ceil() as usize;
         Self { cell_px, columns: cells(size_px.x), rows: cells(size_px.y) }
     }
 

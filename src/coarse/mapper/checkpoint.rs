@@ -1,8 +1,8 @@
 //! What a reconstruction is given besides its input and options, and how one that was stopped goes on.
 //!
-//! Everything before a model grows (tracks, the initial pair) is done again: it is quick. The growth itself is kept after every
-//! adjustment of all that there is, and as the input, the options and the seed are the same, a model that is taken up there becomes the
-//! one it would have become.
+//! Everything before a model grows (tracks, the initial pair) is done again: it is quick. The growth itself is kept
+//! after every adjustment of all that there is, and as the input, the options and the seed are the same, a model that
+//! is taken up there becomes the one it would have become.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;

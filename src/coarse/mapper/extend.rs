@@ -7,9 +7,10 @@ use crate::coarse::Tracks;
 use crate::coarse::rotation_cycles::RotationForest;
 use crate::scene::{ImageId, Reconstruction};
 
-/// The models of `input`, given those of the same images from some of its pairs. Where each component of the graph has one model
-/// with all its images, the poses are there already: all tracks are triangulated anew and everything is adjusted, which takes a
-/// third of the time. Where images are missing or models may be joined now, all is reconstructed from the start.
+/// The models of `input`, given those of the same images from some of its pairs. Where each component of the graph has
+/// one model with all its images, the poses are there already: all tracks are triangulated anew and everything is
+/// adjusted, which takes a third of the time. Where images are missing or models may be joined now, all is
+/// reconstructed from the start.
 pub fn extend(
     input: &MapperInput,
     models: &CoarseModels,

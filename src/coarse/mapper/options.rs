@@ -56,8 +56,8 @@ pub struct MapperOptions {
     pub global_bundle: BundleOptions,
     /// Which intrinsics are estimated.
     pub intrinsics: IntrinsicsOptions,
-    /// When a pose contradicts the rotations of much stronger pairs and is not taken. Pairs themselves are held against stronger
-    /// ones by the same measure.
+    /// When a pose contradicts the rotations of much stronger pairs and is not taken. Pairs themselves are held against
+    /// stronger ones by the same measure.
     pub rotation_cycles: RotationCycleOptions,
     /// Share of the points an image should see that it must keep for its pose to count as settled; below, it is placed anew
     /// to find out whether it shares its camera.

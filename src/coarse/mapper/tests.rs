@@ -136,8 +136,8 @@ fn two_images_that_match_each_other_alone_are_too_few() {
     assert_eq!(models.unregistered, (0..4).map(ImageId).zip(why).collect());
 }
 
-/// An image with a repeated pattern: it seems to see a few points of the model as another image does, while a strong pair says that
-/// it was turned away from there.
+/// An image with a repeated pattern: it seems to see a few points of the model as another image does, while a strong
+/// pair says that it was turned away from there.
 #[test]
 fn a_pose_that_strong_pairs_contradict_is_not_taken() {
     let options = SceneOptions { num_images: 16, num_points: 1500, pixel_noise_px: 0.5, ..SceneOptions::default() };
@@ -198,8 +198,8 @@ impl Checkpoints for Kept {
     }
 }
 
-/// Two scenes without a common point, so that there are two models, of two zooms each: wherever a reconstruction is stopped, going on
-/// from what was kept gives the same models to the last bit.
+/// Two scenes without a common point, so that there are two models, of two zooms each: wherever a reconstruction is
+/// stopped, going on from what was kept gives the same models to the last bit.
 #[test]
 fn a_stopped_reconstruction_goes_on_from_what_was_kept() {
     let options = SceneOptions { num_images: 12, num_points: 600, zoom: 1.3, ..SceneOptions::default() };

@@ -11,6 +11,7 @@ use nalgebra::Vector3;
 use super::{ColmapImage, ColmapPoint, ColmapPoint2d, checked_camera, checked_pose, points_with_mean_errors};
 use crate::camera::{Camera, CameraModel, Pixel};
 use crate::formats::FormatError;
+use crate::formats::shortest::Shortest;
 use crate::scene::{ImageId, Reconstruction};
 
 /// Writes `cameras.txt`.
@@ -22,7 +23,7 @@ pub fn write_cameras_txt(model: &Reconstruction, out: &mut impl Write) -> io::Re
     for (id, camera) in model.used_cameras() {
         write!(out, "{} {} {} {}", id.0 + 1, camera.model.colmap_name(), camera.width, camera.height)?;
         for param in camera.params() {
-            write!(out, " {param}")?;
+            write!(out, " {}", Shortest(*param))?;
         }
         writeln!(out)?;
     }
@@ -46,11 +47,11 @@ pub fn write_images_txt<'a>(
             return Err(io::Error::new(io::ErrorKind::InvalidInput, "an image name holds a line break"));
         }
         let (q, t) = (image.cam_from_world.rotation, image.cam_from_world.translation);
-        write!(out, "{} {} {} {} {}", id.0 + 1, q.w, q.i, q.j, q.k)?;
-        writeln!(out, " {} {} {} {} {name}", t.x, t.y, t.z, image.camera.0 + 1)?;
+        write!(out, "{} {} {} {} {}", id.0 + 1, Shortest(q.w), Shortest(q.i), Shortest(q.j), Shortest(q.k))?;
+        writeln!(out, " {} {} {} {} {name}", Shortest(t.x), Shortest(t.y), Shortest(t.z), image.camera.0 + 1)?;
         let mut blank = "";
         for (keypoint, point) in image.keypoints.iter().zip(image.points()) {
-            write!(out, "{blank}{} {} ", keypoint.0.x, keypoint.0.y)?;
+            write!(out, "{blank}{} {} ", Shortest(keypoint.0.x), Shortest(keypoint.0.y))?;
             match point {
                 Some(id) => write!(out, "{}", id.index() as u64 + 1)?,
                 None => write!(out, "-1")?,
@@ -70,8 +71,8 @@ pub fn write_points3d_txt(model: &Reconstruction, out: &mut impl Write) -> io::R
     writeln!(out, "# One point a line: POINT3D_ID X Y Z R G B ERROR (IMAGE_ID POINT2D_IDX)[]")?;
     for (id, point, error_px) in points_with_mean_errors(model) {
         let (xyz, [r, g, b]) = (point.xyz, point.color);
-        write!(out, "{} {} {} {} {r} {g} {b}", id.index() as u64 + 1, xyz.x, xyz.y, xyz.z)?;
-        write!(out, " {error_px}")?;
+        write!(out, "{} {} {} {}", id.index() as u64 + 1, Shortest(xyz.x), Shortest(xyz.y), Shortest(xyz.z))?;
+        write!(out, " {r} {g} {b} {}", Shortest(error_px))?;
         for seen in &point.track {
             write!(out, " {} {}", seen.image.0 + 1, seen.keypoint.0)?;
         }

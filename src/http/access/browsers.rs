@@ -1,8 +1,8 @@
 //! What pages of other sites may do with this service: nothing, unless they are on the list.
 //!
-//! A browser sends its stored credentials along with whatever a page of another site makes it send, and reaches services that
-//! listen on its own machine only. So a request that changes something is refused when the browser says that another site sent it,
-//! and answers are readable for the listed sites alone.
+//! A browser sends its stored credentials along with whatever a page of another site makes it send, and reaches
+//! services that listen on its own machine only. So a request that changes something is refused when the browser says
+//! that another site sent it, and answers are readable for the listed sites alone.
 
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};

@@ -1,9 +1,10 @@
 //! Connections: accepted, served as HTTP/1.1, and closed when their other end is too slow.
 //!
-//! Whoever opens a connection holds a socket and some memory of this process. So each phase has its limit: the head of a request
-//! must come within a time, its body must bring a least rate while the service waits for it ([`PacedBody`]), and a reader that
-//! takes nothing is given up ([`StallLimit`]). Event streams and long downloads last as long as they last. When all places are
-//! taken, the connection that has waited longest for a request makes room for a new one ([`Waiting`]).
+//! Whoever opens a connection holds a socket and some memory of this process. So each phase has its limit: the head of
+//! a request must come within a time, its body must bring a least rate while the service waits for it ([`PacedBody`]),
+//! and a reader that takes nothing is given up ([`StallLimit`]). Event streams and long downloads last as long as they
+//! last. When all places are taken, the connection that has waited longest for a request makes room for a new one
+//! ([`Waiting`]).
 
 mod paced_body;
 mod stall_limit;

@@ -11,8 +11,8 @@ use tokio::time::{Instant, Sleep, sleep_until};
 
 use crate::config::ConnectionLimits;
 
-/// Fails when the sender brought too little in a window of time. Only time in which the service waits for the sender counts: one
-/// that the service keeps waiting, as while a photograph is stored, is not slow.
+/// Fails when the sender brought too little in a window of time. Only time in which the service waits for the sender
+/// counts: one that the service keeps waiting, as while a photograph is stored, is not slow.
 pub(super) struct PacedBody<B> {
     body: B,
     window: Duration,

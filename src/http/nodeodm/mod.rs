@@ -1,8 +1,8 @@
-//! A second face of the service: the interface of NodeODM, which WebODM, CloudODM, ClusterODM and PyODM speak. A task is the job
-//! of the same id; datasets, jobs, tokens and limits are those of the rest.
+//! A second face of the service: the interface of NodeODM, which WebODM, CloudODM, ClusterODM and PyODM speak. A task
+//! is the job of the same id; datasets, jobs, tokens and limits are those of the rest.
 //!
-//! Its clients take an error for one only when it comes as `{"error": "..."}` with status 200, and a missing token likewise; what
-//! they should try again has its honest status.
+//! Its clients take an error for one only when it comes as `{"error": "..."}` with status 200, and a missing token
+//! likewise; what they should try again has its honest status.
 
 mod answers;
 mod console;

@@ -1,5 +1,5 @@
-//! New tasks: begun, filled and committed in three kinds of requests, or sent in one. Every one of them may be sent again when its
-//! answer was lost.
+//! New tasks: begun, filled and committed in three kinds of requests, or sent in one. Every one of them may be sent
+//! again when its answer was lost.
 
 use axum::Router;
 use axum::extract::{Path, Request, State};

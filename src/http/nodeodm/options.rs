@@ -1,5 +1,5 @@
-//! The options that clients of NodeODM can set, and what they are to the engine. An option that is not listed here is dropped, as
-//! NodeODM does: its clients keep presets for other engines.
+//! The options that clients of NodeODM can set, and what they are to the engine. An option that is not listed here is
+//! dropped, as NodeODM does: its clients keep presets for other engines.
 
 use serde::Serialize;
 use serde_json::{Map, Value, json};

@@ -47,8 +47,7 @@ async fn list(
         limit + 1,
     )
     .await?;
-    let more = cut(&mut rows, limit);
-    let next_cursor = rows.last().filter(|_| more).map(|row| row.seq.to_string());
+    let next_cursor = cut(&mut rows, limit, |row| row.seq.to_string());
     let datasets = rows.into_iter().map(wire::Dataset::new).collect();
     Ok(axum::Json(wire::DatasetPage { datasets, next_cursor }).into_response())
 }
@@ -95,8 +94,7 @@ async fn images(
     let limit = page.limit()?;
     find(&state, id).await?;
     let mut rows = dataset_images::list(state.jobs.store.db.reader(), id, page.text(), limit + 1).await?;
-    let more = cut(&mut rows, limit);
-    let next_cursor = rows.last().filter(|_| more).map(|row| row.path.clone());
+    let next_cursor = cut(&mut rows, limit, |row| row.path.clone());
     let images = rows.into_iter().map(wire::DatasetImage::new).collect();
     Ok(axum::Json(wire::DatasetImagePage { images, next_cursor }).into_response())
 }

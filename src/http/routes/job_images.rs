@@ -56,8 +56,7 @@ async fn list(
         Some(Verdict::Rejected) => (Some("rejected"), counts.rejected),
     };
     let mut rows = job_images::list(reader, job, verdict, page.number_or(-1)?, limit + 1).await?;
-    let more = cut(&mut rows, limit);
-    let next_cursor = rows.last().filter(|_| more).map(|row| row.n.to_string());
+    let next_cursor = cut(&mut rows, limit, |row| row.n.to_string());
     let images = rows.into_iter().map(|row| wire::JobImage::new(job, row)).collect();
     Ok(axum::Json(wire::JobImagePage { images, total, next_cursor }).into_response())
 }

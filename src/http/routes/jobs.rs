@@ -66,8 +66,7 @@ async fn list(
         limit + 1,
     )
     .await?;
-    let more = cut(&mut rows, limit);
-    let next_cursor = rows.last().filter(|_| more).map(|row| row.seq.to_string());
+    let next_cursor = cut(&mut rows, limit, |row| row.seq.to_string());
     let mut places = match rows.iter().any(|row| state_of(row) == JobState::Queued) {
         true => state.jobs.places(state.config.parallel_jobs).await?,
         false => BTreeMap::new(),

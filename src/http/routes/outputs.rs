@@ -13,7 +13,8 @@ use crate::http::problem::{Code, Problem};
 use crate::http::{AppState, wire};
 use crate::store::db::job_outputs;
 
-/// Outputs may be pages with scripts made out of what senders named and wrote: they run in an origin of their own and load nothing.
+/// Outputs may be pages with scripts made out of what senders named and wrote: they run in an origin of their own and
+/// load nothing.
 const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; \
      script-src 'unsafe-inline'; sandbox allow-scripts allow-popups";
 

@@ -157,8 +157,8 @@ async fn create(State(state): State<AppState>, principal: Principal, request: Re
     Ok(created(&row, with_bytes))
 }
 
-/// An upload whose bytes all come with it: it waits in memory and is made when they are there. Of one that breaks off nothing is kept,
-/// since its sender never learns an address.
+/// An upload whose bytes all come with it: it waits in memory and is made when they are there. Of one that breaks off
+/// nothing is kept, since its sender never learns an address.
 async fn create_whole(
     state: &AppState,
     new: NewUpload,

@@ -27,8 +27,8 @@ const SEGMENT_BYTES: u64 = 32 << 20;
 const DRAIN_IDLE: Duration = Duration::from_millis(100);
 /// That other request waits no longer.
 const DRAIN_MOST: Duration = Duration::from_millis(500);
-/// Chunks, each what one read of the connection brought, go to the writer in lots of so many bytes: to wake it costs more than to
-/// write a chunk.
+/// Chunks, each what one read of the connection brought, go to the writer in lots of so many bytes: to wake it costs
+/// more than to write a chunk.
 const LOT_BYTES: usize = 256 << 10;
 /// Lots on their way to the writer.
 const QUEUED_LOTS: usize = 3;
@@ -100,7 +100,8 @@ pub(in crate::http) async fn append(mut request: Append, body: Body) -> Result<(
     taken.map(|_| (request.row, request.guard))
 }
 
-/// Takes the body in and notes in the row what is durable; gives the hash of the upload's bytes where all of them came just now.
+/// Takes the body in and notes in the row what is durable; gives the hash of the upload's bytes where all of them came
+/// just now.
 async fn take_in(request: &mut Append, body: Body) -> Result<Option<[u8; 32]>, Problem> {
     let start = u64::try_from(request.row.offset).unwrap_or(0);
     let end_bytes = request.row.length.and_then(|length| u64::try_from(length).ok()).unwrap_or(request.max_bytes);

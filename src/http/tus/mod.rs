@@ -1,4 +1,5 @@
-//! The tus 1.0.0 protocol of resumable uploads: its headers, its locks, and bytes on their way into an upload or, whole, to the store.
+//! The tus 1.0.0 protocol of resumable uploads: its headers, its locks, and bytes on their way into an upload or,
+//! whole, to the store.
 
 mod append;
 mod headers;

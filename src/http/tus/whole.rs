@@ -11,8 +11,8 @@ use super::Checksum;
 use crate::config::UploadLimits;
 use crate::http::problem::{Code, Problem};
 
-/// Photographs lie in pieces of so many bytes. Used ones are kept for the next: to get fresh memory from the system, page by page, costs
-/// more than to fill it.
+/// Photographs lie in pieces of so many bytes. Used ones are kept for the next: to get fresh memory from the system,
+/// page by page, costs more than to fill it.
 const PIECE_BYTES: usize = 128 << 10;
 
 /// The memory that all of them may take.

@@ -81,8 +81,8 @@ pub(super) async fn send(
     tokio::time::timeout(policy.timeout, sent).await.map_err(|_| SendError::Timeout)?
 }
 
-/// Connects to the first of the host's addresses that takes the connection, provided that all of them are acceptable: a name with
-/// one foot in this network is a trick.
+/// Connects to the first of the host's addresses that takes the connection, provided that all of them are acceptable: a
+/// name with one foot in this network is a trick.
 async fn connect(resolver: &impl Resolve, target: &Target, allowed: &[IpNetwork]) -> Result<TcpStream, SendError> {
     let addresses = resolver.resolve(&target.host(), target.port()).await.map_err(|_| SendError::Resolve)?;
     if addresses.iter().any(|address| !may_connect(address.ip(), allowed)) {

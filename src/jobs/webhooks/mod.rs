@@ -1,5 +1,5 @@
-//! Tells addresses of a job's changes of state: signed, in order, again and again until they answer or it is given up. What is to
-//! be told stands in the database, written with the change itself, so it survives the end of the process.
+//! Tells addresses of a job's changes of state: signed, in order, again and again until they answer or it is given up.
+//! What is to be told stands in the database, written with the change itself, so it survives the end of the process.
 
 mod body;
 mod client;

@@ -75,8 +75,8 @@ pub struct Target {
 }
 
 impl Target {
-    /// Reads an address. Every way to write an IP address (decimal, octal, hexadecimal, shortened, in other digits) is understood,
-    /// and judged as the address it means.
+    /// Reads an address. Every way to write an IP address (decimal, octal, hexadecimal, shortened, in other digits) is
+    /// understood, and judged as the address it means.
     ///
     /// # Errors
     /// Why it is refused.

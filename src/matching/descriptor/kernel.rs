@@ -241,8 +241,9 @@ unsafe fn update<K: Kernel, const Q: usize>(
     }
 }
 
-/// The best and second best over the sixteen lanes. Neither this nor its callers use closures around the methods of `K`: a closure
-/// is compiled without the instructions of the function around it, and every one of `K` in it becomes a call through memory.
+/// The best and second best over the sixteen lanes. Neither this nor its callers use closures around the methods of
+/// `K`: a closure is compiled without the instructions of the function around it, and every one of `K` in it becomes a
+/// call through memory.
 #[inline(always)]
 pub(super) unsafe fn reduce<K: Kernel>(running: &Running<K::Lanes>) -> Top2 {
     let (mut best, mut second, mut group) = ([0; GROUP_ROWS], [0; GROUP_ROWS], [0; GROUP_ROWS]);

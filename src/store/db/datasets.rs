@@ -93,8 +93,8 @@ pub async fn place(db: impl SqliteExecutor<'_>, id: Uuid, path: &str) -> sqlx::R
     sqlx::query_as(select_place!()).bind(path).bind(id.to_string()).fetch_optional(db).await
 }
 
-/// Datasets older than the one with `seq` `before`, newest first, of one token or of all. One whose upload is not complete yet is
-/// left out.
+/// Datasets older than the one with `seq` `before`, newest first, of one token or of all. One whose upload is not
+/// complete yet is left out.
 pub async fn list(
     db: impl SqliteExecutor<'_>,
     owner_token: Option<&str>,
@@ -150,8 +150,8 @@ pub async fn release_owner(db: &mut SqliteConnection, job: Uuid) -> sqlx::Result
     Ok(())
 }
 
-/// Datasets that no job refers to, no upload goes to, and to which nothing was added since a time. Those whose upload is still under
-/// way are left out.
+/// Datasets that no job refers to, no upload goes to, and to which nothing was added since a time. Those whose upload
+/// is still under way are left out.
 pub async fn unused_since(db: impl SqliteExecutor<'_>, before_ms: i64) -> sqlx::Result<Vec<String>> {
     sqlx::query_scalar(
         "SELECT id FROM datasets d WHERE owner_job IS NULL AND MAX(created_ms, COALESCE(changed_ms, 0)) < ?

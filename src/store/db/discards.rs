@@ -1,5 +1,5 @@
-//! Folders whose rows are deleted and whose files are still to go; triggers on `jobs` and `datasets` fill the table. While a copy of
-//! the data directory is under way, they stay.
+//! Folders whose rows are deleted and whose files are still to go; triggers on `jobs` and `datasets` fill the table.
+//! While a copy of the data directory is under way, they stay.
 
 use sqlx::{SqliteConnection, SqliteExecutor};
 use uuid::Uuid;

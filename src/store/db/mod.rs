@@ -1,8 +1,8 @@
 //! SQLite: the only place with SQL, one file per table.
 //!
-//! WAL with `synchronous=FULL`: what was committed survives a power cut. All writes go through one connection and start with
-//! BEGIN IMMEDIATE, because a deferred transaction that turns into a writer fails at once when another wrote meanwhile, whatever
-//! the busy timeout; readers have their own connections and never wait.
+//! WAL with `synchronous=FULL`: what was committed survives a power cut. All writes go through one connection and start
+//! with BEGIN IMMEDIATE, because a deferred transaction that turns into a writer fails at once when another wrote
+//! meanwhile, whatever the busy timeout; readers have their own connections and never wait.
 
 pub mod dataset_images;
 pub mod datasets;
@@ -64,8 +64,8 @@ impl Db {
             .acquire_timeout(Duration::from_secs(60))
             // There is no network in between that could have closed it.
             .test_before_acquire(false)
-            // A commit that fails, as on a full disk, may leave a connection that believes to be in a transaction which SQLite has
-            // rolled back; it would refuse every further one.
+            // A commit that fails, as on a full disk, may leave a connection that believes to be in a transaction which
+            // SQLite has rolled back; it would refuse every further one.
             .after_release(|connection, _| {
                 Box::pin(async move {
                     connection.ping().await?;

@@ -68,8 +68,8 @@ pub async fn insert(db: &mut SqliteConnection, upload: &UploadRow) -> sqlx::Resu
     Ok(())
 }
 
-/// Adds an upload that is a photograph of its dataset already, and the photograph, all in one request to SQLite; gives what was known
-/// of the path before, and none without such a dataset. Where a photograph was known before, it stays.
+/// Adds an upload that is a photograph of its dataset already, and the photograph, all in one request to SQLite; gives
+/// what was known of the path before, and none without such a dataset. Where a photograph was known before, it stays.
 pub async fn insert_stored(
     db: &mut SqliteConnection,
     upload: &UploadRow,

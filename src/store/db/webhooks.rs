@@ -122,8 +122,8 @@ pub async fn deliveries(db: impl SqliteExecutor<'_>, job: Uuid) -> sqlx::Result<
     .await
 }
 
-/// Deliveries to be tried now, the longest overdue first: of every webhook the first that is pending alone, so that each hears of
-/// changes in their order.
+/// Deliveries to be tried now, the longest overdue first: of every webhook the first that is pending alone, so that
+/// each hears of changes in their order.
 pub async fn due(db: impl SqliteExecutor<'_>, now_ms: i64, limit: u32) -> sqlx::Result<Vec<DueRow>> {
     sqlx::query_as(
         "SELECT d.*, w.url, w.secret, w.audience, w.job_id, j.name AS job_name, j.created_ms, j.started_ms, j.finished_ms,

@@ -1,7 +1,8 @@
 //! Transactions that write: one at a time, each timed.
 //!
-//! How long a write takes has two causes that want different cures: the disk, which syncs as fast as it does, and everything else,
-//! which is ours. So the time of a write is counted without the time in which the writer waited for the disk.
+//! How long a write takes has two causes that want different cures: the disk, which syncs as fast as it does, and
+//! everything else, which is ours. So the time of a write is counted without the time in which the writer waited for
+//! the disk.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::atomic::{AtomicU64, Ordering};

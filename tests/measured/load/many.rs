@@ -21,9 +21,9 @@ const CONNECTIONS: usize = 8;
 const FILE_BYTES: usize = 4 << 20;
 /// Folders that they go to.
 const FOLDERS: usize = 100;
-/// Disk and service take turns, so many bytes each: disks are not the same all the time, nor is memory. A virtual machine gives back to
-/// its host what was free for a few seconds, and whoever gets it again pays for that more than for the writing. So what was written is
-/// emptied after every round, and both find the same.
+/// Disk and service take turns, so many bytes each: disks are not the same all the time, nor is memory. A virtual
+/// machine gives back to its host what was free for a few seconds, and whoever gets it again pays for that more than
+/// for the writing. So what was written is emptied after every round, and both find the same.
 const ROUND_BYTES: usize = 512 << 20;
 /// Share of what the disk gives that uploads must reach. A short run tells little, so it only has to be in reach.
 const SHARE_OF_DISK: f64 = 0.7;
@@ -47,8 +47,8 @@ fn cpu_s(process: u32) -> f64 {
     (ticks(14) + ticks(15)) / TICKS_PER_S
 }
 
-/// Empties every file below a folder, which gives its bytes back. Deleted files would hold up whoever makes files next: ext4 hands out
-/// none of their inodes for a while and searches for others.
+/// Empties every file below a folder, which gives its bytes back. Deleted files would hold up whoever makes files next:
+/// ext4 hands out none of their inodes for a while and searches for others.
 fn empty_files(folder: &Path) {
     for entry in std::fs::read_dir(folder).unwrap() {
         let entry = entry.unwrap();

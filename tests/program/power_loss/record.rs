@@ -1,7 +1,7 @@
 //! What a process did to files, as strace recorded it, and what a disk holds that lost its power in the middle.
 //!
-//! A disk keeps what was synced: the bytes of a file that were written before a sync of it began, the entries of a folder likewise.
-//! Of the rest it keeps nothing, or any part of it.
+//! A disk keeps what was synced: the bytes of a file that were written before a sync of it began, the entries of a
+//! folder likewise. Of the rest it keeps nothing, or any part of it.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;

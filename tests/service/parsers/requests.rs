@@ -1,5 +1,6 @@
-//! Readers of what comes within requests: forms, and the headers of resumable uploads. They are reached as senders reach them, through
-//! the router of a service whose directory lies in memory; an answer of its own fault (5xx) is a failure.
+//! Readers of what comes within requests: forms, and the headers of resumable uploads. They are reached as senders
+//! reach them, through the router of a service whose directory lies in memory; an answer of its own fault (5xx) is a
+//! failure.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};

@@ -1,5 +1,5 @@
-//! Everything that reads bytes of others, one function each, which may refuse but neither panic nor run away. The tests feed them
-//! mangled files, the fuzzers in `fuzz/` whatever they think of.
+//! Everything that reads bytes of others, one function each, which may refuse but neither panic nor run away. The tests
+//! feed them mangled files, the fuzzers in `fuzz/` whatever they think of.
 
 #[path = "requests.rs"]
 mod requests;

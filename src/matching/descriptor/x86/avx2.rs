@@ -1,4 +1,5 @@
-//! The kernel for AVX2 alone. The product of bytes (`vpmaddubsw`) adds pairs up in 16 bits and saturates, so there are two ways.
+//! The kernel for AVX2 alone. The product of bytes (`vpmaddubsw`) adds pairs up in 16 bits and saturates, so there are
+//! two ways.
 //!
 //! *Short*: with 64 taken from the query's bytes (all of them 0 to 191) a product is at most m v, where m = max |q - 64| and v
 //! the row's byte, and four of them, from two quads, add up to no more than m times the row's sum of four. Where that is below
