@@ -15,7 +15,7 @@ const PAIR_WORK: usize = 4;
 const SIGHTING_WORK: usize = 8;
 /// Work below which a part is not worth a thread, and the most parts there are. Both are fixed so that sums are taken in the
 /// same order by any number of threads.
-const MIN_PART_WORK: usize = 200_000;
+const MIN_PART_WORK: usize = 50_000;
 const MAX_PARTS: usize = 16;
 
 /// A range of points that one thread eliminates.
