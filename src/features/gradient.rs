@@ -31,11 +31,13 @@ impl Patch {
         Self { window: zeros(), window_from: 0, weight: zeros(), direction: zeros() }
     }
 
-    /// Sets the Gaussian window around `x` for the columns `from..to`.
+    /// Sets the columns' part of the Gaussian window exp(falloff (dx^2 + dy^2)) around `x`, for the columns `from..to`.
     #[inline(always)]
     pub(super) fn set_window(&mut self, x: f32, falloff: f32, from: usize, to: usize) {
         self.window_from = from;
-        fill_window(&mut self.window, (from..to).map(|column| column as f32 - x), falloff);
+        for (column, weight) in (from..to).zip(&mut self.window) {
+            *weight = (falloff * (column as f32 - x).powi(2)).exp();
+        }
     }
 
     /// Gradients by central differences of the pixels `from..to` of row `y`, weighted by the window's columns and
@@ -62,14 +64,6 @@ impl Patch {
             &mut self.direction[..padded],
         );
         count
-    }
-}
-
-/// The columns' part of the Gaussian window exp(falloff (dx^2 + dy^2)), for columns this far from its middle.
-#[inline(always)]
-pub(super) fn fill_window(window: &mut [f32], dx: impl Iterator<Item = f32>, falloff: f32) {
-    for (weight, dx) in window.iter_mut().zip(dx) {
-        *weight = (falloff * (dx * dx)).exp();
     }
 }
 

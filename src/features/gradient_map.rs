@@ -29,6 +29,12 @@ pub(super) fn length(gradient: Gradient) -> f32 {
     f32::from_bits(gradient & LENGTH_BITS)
 }
 
+/// The direction of a gradient, of 2^32 to a turn.
+#[inline(always)]
+pub(super) fn direction(gradient: Gradient) -> u32 {
+    gradient << 16
+}
+
 /// The last rows of gradients of a level, of every second row and column: the gradient in column c of row r is that of pixel
 /// 2 c of row 2 r. On the border there are none, and what is stored there means nothing.
 pub(super) struct GradientMap {
@@ -52,10 +58,37 @@ impl GradientMap {
         }
     }
 
-    /// `length` gradients of row `row` from column `from` on.
-    #[inline]
-    pub(super) fn stretch(&self, row: usize, from: usize, length: usize) -> &[Gradient] {
-        self.rows.stretch(row, from, length)
+    /// The rows up to `radius_px` from the pixel row `y`.
+    pub(super) fn around(&self, y: f32, radius_px: f32) -> Rows<'_> {
+        let first = ((y - radius_px).max(0.0) / STEP as f32) as usize;
+        let (data, stride, capacity) = self.rows.stored();
+        let (stride, capacity) = (stride as u32, capacity as u32);
+        Rows { data, stride, capacity, before: first as u32 / capacity * capacity }
+    }
+}
+
+/// Some rows of a gradient map, no more than it holds.
+pub(super) struct Rows<'a> {
+    data: &'a [Gradient],
+    stride: u32,
+    capacity: u32,
+    /// Rows before the last one at or above these that lies at the start of the ring.
+    before: u32,
+}
+
+impl Rows<'_> {
+    /// Where the gradient of a row and a column is stored.
+    #[inline(always)]
+    pub(super) fn index(&self, row: u32, column: u32) -> u32 {
+        let row = row.wrapping_sub(self.before);
+        // One round of the ring is taken off where there is one: without, the difference is beyond all rows.
+        row.min(row.wrapping_sub(self.capacity)) * self.stride + column
+    }
+
+    /// The gradient stored there.
+    #[inline(always)]
+    pub(super) fn at(&self, index: u32) -> Gradient {
+        self.data[index as usize]
     }
 }
 
@@ -102,7 +135,8 @@ mod tests {
                     for x in (2..width - 1).step_by(STEP) {
                         let dx = pixels[even][x + 1] - pixels[even][x - 1];
                         let dy = pixels[even + 1][x] - pixels[even - 1][x];
-                        let found = map.stretch(even / STEP, x / STEP, 1)[0];
+                        let rows = map.around(even as f32, 4.0);
+                        let found = rows.at(rows.index((even / STEP) as u32, (x / STEP) as u32));
                         let off = (length(found) / dx.hypot(dy) - 1.0).abs();
                         assert!(off < 1.0 / 256.0, "length of {x}, {even} is off by {off}");
                         let turn = TAU / TURN as f32;

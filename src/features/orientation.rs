@@ -86,34 +86,37 @@ fn add_window_body<const FMA: bool>(
             continue;
         }
         let count = patch.fill::<FMA>(ring, row, left, right, (falloff * dy * dy).exp());
-        add_to_histograms(&patch.weight[..count], &patch.direction[..count], copies);
+        add_to_histograms(patch, count, copies);
     }
 }
 
-/// Shares each weight between the two bins nearest to its direction; the bin after the last takes what that shares with
-/// the first.
+/// Shares each of the first `count` weights between the two bins nearest to its direction; the bin after the last takes what
+/// that shares with the first.
 #[inline(always)]
-fn add_to_histograms(weight: &[f32], direction: &[f32], copies: &mut Histograms) {
-    for (weights, directions) in weight.chunks(LANES).zip(direction.chunks(LANES)) {
-        let (mut first, mut part) = ([0_u32; LANES], [0.0_f32; LANES]);
-        for (i, direction) in directions.iter().enumerate() {
-            let place = direction * (BINS as f32 / TAU);
+fn add_to_histograms(patch: &Patch, count: usize, copies: &mut Histograms) {
+    let blocks = patch.weight.as_chunks::<LANES>().0.iter().zip(patch.direction.as_chunks::<LANES>().0);
+    for (block, (weights, directions)) in blocks.take(count.div_ceil(LANES)).enumerate() {
+        // Where a whole block adds what ...
+        let (mut first, mut below, mut above) = ([0_u32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+        for i in 0..LANES {
+            let place = directions[i] * (BINS as f32 / TAU);
             let bin = place.trunc().min((BINS - 1) as f32);
-            part[i] = place - bin;
+            above[i] = weights[i] * (place - bin);
+            below[i] = weights[i] - above[i];
             first[i] = whole_number(bin);
         }
-        for (i, &weight) in weights.iter().enumerate() {
+        // ... and the adding.
+        for i in 0..LANES.min(count - block * LANES) {
             let (histogram, bin) = (&mut copies[i % COPIES], (first[i] as usize).min(BINS - 1));
-            let above = weight * part[i];
-            histogram[bin] += weight - above;
-            histogram[bin + 1] += above;
+            histogram[bin] += below[i];
+            histogram[bin + 1] += above[i];
         }
     }
 }
 
 /// The whole pixels within `radius` of `center` that are not on the border, as a half-open range.
 #[inline(always)]
-pub(super) fn clip(center: f32, radius: f32, length: usize) -> (usize, usize) {
+fn clip(center: f32, radius: f32, length: usize) -> (usize, usize) {
     // Without these, `ceil` and `floor` are library calls on the x86-64 baseline, for every row of every keypoint.
     let above = |value: f32| value as i32 + i32::from((value as i32 as f32) < value);
     let below = |value: f32| value as i32 - i32::from((value as i32 as f32) > value);

@@ -45,6 +45,11 @@ impl<T: Copy + Default> Ring<T> {
         &self.data[start..start + length]
     }
 
+    /// All that is stored, how many values a row takes, and the capacity: row `y` is stored as row `y % capacity`.
+    pub(super) fn stored(&self) -> (&[T], usize, usize) {
+        (&self.data, self.stride, self.capacity)
+    }
+
     /// Makes room for the next `count` rows (fewer than the capacity) and returns them in order, to be filled.
     pub(super) fn push_rows(&mut self, count: usize) -> Vec<&mut [T]> {
         let first = self.next % self.capacity;

@@ -16,8 +16,10 @@ pub(super) enum Verdict {
     Apart {
         /// Median distance of the places in units of their distance from the camera.
         displacement: f64,
-        /// Share of the matches whose places coincide nevertheless.
-        coinciding: f64,
+        /// Matches whose places coincide nevertheless ...
+        coinciding: usize,
+        /// ... of so many with a place for both keypoints.
+        judged: usize,
     },
     /// No model holds both images with enough points.
     Unknown,
@@ -47,8 +49,9 @@ pub(super) fn judge(
             if displacement <= options.max_displacement {
                 return Verdict::Together;
             }
-            let near = displacements.iter().filter(|&&displacement| displacement <= options.max_displacement).count();
-            Verdict::Apart { displacement, coinciding: near as f64 / displacements.len() as f64 }
+            let coinciding =
+                displacements.iter().filter(|&&displacement| displacement <= options.max_displacement).count();
+            Verdict::Apart { displacement, coinciding, judged: displacements.len() }
         })
         .collect()
 }

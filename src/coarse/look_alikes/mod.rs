@@ -112,12 +112,14 @@ pub fn reconstruct(
 fn cut_pairs(suspects: &[Suspect], verdicts: &[Verdict], options: &LookAlikeOptions) -> Vec<CutPair> {
     let ambiguous = verdicts.iter().any(|verdict| matches!(verdict, Verdict::Apart { .. }));
     let cut = suspects.iter().zip(verdicts).filter_map(|(suspect, verdict)| {
-        let (displacement, one_place) = match *verdict {
+        let (displacement, in_one_place, of) = match *verdict {
             Verdict::Together => return None,
             Verdict::Unknown if !ambiguous => return None,
-            Verdict::Unknown => (None, suspect.agreeing as f64 / suspect.matches as f64),
-            Verdict::Apart { displacement, coinciding } => (Some(displacement), coinciding),
+            Verdict::Unknown => (None, suspect.agreeing, suspect.matches),
+            Verdict::Apart { displacement, coinciding, judged } => (Some(displacement), coinciding, judged),
         };
+        let shares_place = in_one_place >= options.min_shared_place_matches
+            && in_one_place as f64 > options.shared_place_share * of as f64;
         Some(CutPair {
             images: suspect.images,
             matches: suspect.matches,
@@ -125,7 +127,7 @@ fn cut_pairs(suspects: &[Suspect], verdicts: &[Verdict], options: &LookAlikeOpti
             strength: suspect.strength,
             chain_strength: suspect.chain_strength,
             displacement,
-            apart: one_place <= options.shared_place_share,
+            apart: !shares_place,
         })
     });
     cut.collect()

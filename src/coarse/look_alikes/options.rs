@@ -26,6 +26,8 @@ pub struct LookAlikeOptions {
     /// Images of a cut pair are held apart for good, so that no point joins them, unless more than this share of its matches
     /// joins one place after all: pictures of one wall with a repeated pattern share the wall.
     pub shared_place_share: f64,
+    /// So many matches must join that place, too. As many as verify a pair: a few may join one by chance.
+    pub min_shared_place_matches: usize,
     /// Matches with a place for both keypoints that a judgement needs.
     pub min_judged_matches: usize,
     /// A doubted pair is cut when the two places of its median match lie farther apart than this, in units of their distance
@@ -42,6 +44,7 @@ impl Default for LookAlikeOptions {
             joining_share: 0.8,
             alarming_share: 0.25,
             shared_place_share: 0.1,
+            min_shared_place_matches: 15,
             min_judged_matches: 8,
             max_displacement: 0.1,
         }

@@ -204,3 +204,22 @@ fn a_walk_that_comes_back_keeps_every_pair() {
     assert_eq!(models.models[0].images().len(), world.input.images.len());
     assert!(world.input.graph.pairs.contains_key(&(ImageId(0), ImageId(35))), "the walk must come back");
 }
+
+#[test]
+fn a_cut_pair_shares_a_place_only_when_enough_of_its_matches_do() {
+    let suspect = Suspect {
+        images: (ImageId(0), ImageId(1)),
+        matches: 200,
+        known: 100,
+        agreeing: 0,
+        strength: 0.1,
+        chain_strength: 0.5,
+    };
+    let options = LookAlikeOptions::default();
+    let (few, many) = (options.min_shared_place_matches - 1, options.min_shared_place_matches);
+    for (coinciding, judged, apart) in [(few, 20, true), (many, 20, false), (many, 200, true)] {
+        let verdict = Verdict::Apart { displacement: 0.7, coinciding, judged };
+        let cut = cut_pairs(std::slice::from_ref(&suspect), &[verdict], &options);
+        assert_eq!(cut[0].apart, apart, "{coinciding} of {judged}");
+    }
+}
