@@ -48,6 +48,34 @@ pub(super) struct Extremum {
     pub(super) contrast: f32,
 }
 
+/// A quadratic fitted around a grid point, whose extremum is one of contrast and no edge.
+pub(super) struct Fit {
+    /// Column, row and level of the grid point.
+    grid: (usize, usize, usize),
+    inverse_hessian: Matrix3<f32>,
+    /// From the grid point to the extremum of the quadratic.
+    offset: Vector3<f32>,
+    contrast: f32,
+}
+
+impl Fit {
+    /// The extremum of the quadratic.
+    pub(super) fn extremum(&self) -> Extremum {
+        self.extremum_at(&self.offset)
+    }
+
+    /// The extremum where the gradient of a higher polynomial vanishes (see the head of this file).
+    pub(super) fn settled(&self, levels: &Levels) -> Extremum {
+        self.extremum_at(&settle(levels, self.grid, &self.inverse_hessian, self.offset))
+    }
+
+    fn extremum_at(&self, offset: &Vector3<f32>) -> Extremum {
+        let (x, y, s) = self.grid;
+        let (fx, fy, level) = (x as f32 + offset.x, y as f32 + offset.y, s as f32 + offset.z);
+        Extremum { x: fx, y: fy, level, s, contrast: self.contrast }
+    }
+}
+
 stamp!(
     /// `out = a - b`.
     subtract => subtract_body(a: &[f32], b: &[f32], out: &mut [f32])
@@ -174,16 +202,16 @@ fn extremum_lanes(
     Some(hits)
 }
 
-/// Refines the grid extremum in column `x`, row `y` of difference `s`; none when the fit wanders off, the contrast is
-/// below `least` or the curvatures are those of an edge.
-pub(super) fn refine(
+/// Fits the grid extremum in column `x`, row `y` of difference `s`; none when the fit wanders off, the contrast is below
+/// `least` or the curvatures are those of an edge.
+pub(super) fn fit(
     levels: &Levels,
     (mut x, mut y, mut s): (usize, usize, usize),
     least: f32,
     options: &SiftOptions,
-) -> Option<Extremum> {
+) -> Option<Fit> {
     let first_y = y;
-    for fit in 1..=MAX_FITS {
+    for attempt in 1..=MAX_FITS {
         let cube = neighbourhood::<3>(levels, x, y, s);
         let at = |dx: usize, dy: usize, ds: usize| cube[ds][dy][dx];
         let value = at(1, 1, 1);
@@ -196,22 +224,17 @@ pub(super) fn refine(
         let xs = 0.25 * (at(2, 1, 2) + at(0, 1, 0) - at(0, 1, 2) - at(2, 1, 0));
         let ys = 0.25 * (at(1, 2, 2) + at(1, 0, 0) - at(1, 0, 2) - at(1, 2, 0));
         let hessian = Matrix3::new(xx, xy, xs, xy, yy, ys, xs, ys, ss);
-        let inverse = hessian.try_inverse()?;
-        let offset = -(inverse * gradient);
+        let inverse_hessian = hessian.try_inverse()?;
+        let offset = -(inverse_hessian * gradient);
         if !offset.iter().all(|component| component.is_finite()) {
             return None;
         }
-        if offset.amax() <= if fit < MAX_FITS { MOVE_OFFSET } else { MAX_OFFSET } {
+        if offset.amax() <= if attempt < MAX_FITS { MOVE_OFFSET } else { MAX_OFFSET } {
             let contrast = (value + 0.5 * gradient.dot(&offset)).abs();
             let (trace, determinant) = (xx + yy, xx * yy - xy * xy);
             let edge = options.edge_threshold;
             let keeps = contrast > least && trace * trace * edge < (edge + 1.0).powi(2) * determinant;
-            if !keeps {
-                return None;
-            }
-            let offset = settle(levels, (x, y, s), &inverse, offset);
-            let (fx, fy, level) = (x as f32 + offset.x, y as f32 + offset.y, s as f32 + offset.z);
-            return Some(Extremum { x: fx, y: fy, level, s, contrast });
+            return keeps.then_some(Fit { grid: (x, y, s), inverse_hessian, offset, contrast });
         }
         x = step(x, offset.x, 1, levels.width - 2)?;
         y = step(y, offset.y, 1, levels.height - 2)?;
@@ -223,12 +246,12 @@ pub(super) fn refine(
     None
 }
 
-/// Moves an extremum, found at `offset` from a grid point, to where the gradient of a higher polynomial vanishes (see the
-/// head of this file); stays where it is at the border of the image or where the two disagree by [`MAX_SETTLING`].
+/// Moves an extremum, found at `offset` from a grid point, to where the gradient of a higher polynomial vanishes; it stays
+/// where it is at the border of the image or where the two disagree by [`MAX_SETTLING`].
 fn settle(
     levels: &Levels,
     (x, y, s): (usize, usize, usize),
-    inverse: &Matrix3<f32>,
+    inverse_hessian: &Matrix3<f32>,
     offset: Vector3<f32>,
 ) -> Vector3<f32> {
     if x < 2 || y < 2 || x + 2 >= levels.width || y + 2 >= levels.height {
@@ -237,7 +260,7 @@ fn settle(
     let cube = neighbourhood::<5>(levels, x, y, s);
     let mut at = offset;
     for _ in 0..SETTLING_STEPS {
-        at -= inverse * gradient_at(&cube, &at);
+        at -= inverse_hessian * gradient_at(&cube, &at);
     }
     if (at - offset).amax() < MAX_SETTLING { at } else { offset }
 }

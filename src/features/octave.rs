@@ -142,15 +142,18 @@ impl<'a> Octave<'a> {
             for s in 1..=per_octave {
                 candidates.clear();
                 extrema::scan_row(self.isa, &differences[s - 1..=s + 1], y - 1, width, least, &mut candidates);
-                let refined =
-                    candidates.iter().map(|&x| extrema::refine(&self.levels, (x, y - 1, s), least, self.options));
-                extrema.extend(refined.flatten().filter(|extremum| {
-                    let (scale, (x, y)) = (self.scale_px(extremum), self.place_px(extremum));
-                    let class = self.class(extremum);
+                let fits =
+                    candidates.iter().filter_map(|&x| extrema::fit(&self.levels, (x, y - 1, s), least, self.options));
+                let wanted = fits.filter(|fit| {
+                    let extremum = fit.extremum();
+                    let (scale, (x, y)) = (self.scale_px(&extremum), self.place_px(&extremum));
+                    let class = self.class(&extremum);
                     collector.wants_at(x, y)
                         && forecast.as_mut().is_none_or(|forecast| forecast.wants(class, scale))
                         && collector.wants(class, scale)
-                }));
+                });
+                // To settle an extremum takes as long as to fit it, and of a picture full of them most are not wanted.
+                extrema.extend(wanted.map(|fit| fit.settled(&self.levels)));
             }
             if let Some(forecast) = &mut forecast {
                 forecast.finish_row(y, self.step_px());

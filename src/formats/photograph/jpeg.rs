@@ -135,7 +135,7 @@ pub(super) fn decode_gray_and_rgb(
             Ok((gray, convert::shrink_rgb(rgb, max_long_side)))
         }
         (ColorSpace::YCbCr, width, height, data) => {
-            let gray = GrayImage::new(width, height, data.iter().step_by(3).copied().collect());
+            let gray = GrayImage::new(width, height, data.as_chunks::<3>().0.iter().map(|pixel| pixel[0]).collect());
             // Averages commute with the change of colours, which is linear, and less remains to be changed.
             let mut small = convert::shrink_rgb(RgbImage::new(width, height, data), max_long_side);
             convert::ycbcr_to_rgb(&mut small.image.data);
