@@ -23,6 +23,13 @@ pub struct LookAlikeOptions {
     /// The doubted pairs are judged only when one of them agrees in this share or less: then the set holds look-alikes, or a
     /// chain that comes back. Judging costs a coarse model.
     pub alarming_share: f64,
+    /// A pair that a chain contradicts is a rival of the chain's weakest link when it has at least this share of its strength ...
+    pub rival_share: f64,
+    /// ... and at least so many times its matches. Origin of both: measured; where a link was wrong, true pairs had 0.7 of its
+    /// strength and four times its matches, and wrong pairs of two sets of copies have at most 0.44 of that of a true link.
+    pub rival_matches: f64,
+    /// Rivals that are tried before their links, one after the other. Each costs a look at all matches.
+    pub max_rivals: usize,
     /// Images of a cut pair are held apart for good, so that no point joins them, unless more than this share of its matches
     /// joins one place after all: pictures of one wall with a repeated pattern share the wall.
     pub shared_place_share: f64,
@@ -43,6 +50,9 @@ impl Default for LookAlikeOptions {
             agreeing_share: 0.6,
             joining_share: 0.8,
             alarming_share: 0.25,
+            rival_share: 0.6,
+            rival_matches: 2.0,
+            max_rivals: 8,
             shared_place_share: 0.1,
             min_shared_place_matches: 15,
             min_judged_matches: 8,
@@ -64,10 +74,12 @@ impl LookAlikeOptions {
             ("agreeing_share", self.agreeing_share),
             ("joining_share", self.joining_share),
             ("alarming_share", self.alarming_share),
+            ("rival_share", self.rival_share),
             ("shared_place_share", self.shared_place_share),
         ] {
             check((0.0..=1.0).contains(&value), &format!("{name} must be in [0, 1]"));
         }
+        check(self.rival_matches >= 1.0, "rival_matches must be at least 1");
         check(self.min_judged_matches >= 1, "min_judged_matches must be at least 1");
         check(self.max_displacement > 0.0, "max_displacement must be positive");
     }
