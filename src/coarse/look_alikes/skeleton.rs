@@ -31,7 +31,7 @@ pub(super) struct Suspect {
 /// wrong pair and true ones of about the same strength, and then the number of matches tells more: the true ones have
 /// more each. So where a pair that is put off is a rival of the link that it contradicts
 /// ([`LookAlikeOptions::rival_share`]), the skeleton is built with the rival before that link, too, and the one that is
-/// contradicted less is taken. (Fifty photographs around a toy fox were torn by a wrong pair of 59 matches that came just before
+/// contradicted less is taken. (Fifty photographs around a toy fox were torn by a wrong pair of 90 matches that came just before
 /// true ones of 213 and 239.)
 pub(super) fn suspects(input: &MapperInput, options: &LookAlikeOptions, keep_going: &KeepGoing) -> Vec<Suspect> {
     let found =
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn of_rivals_the_link_is_taken_that_fewer_matches_contradict() {
+    fn of_rivals_the_link_is_taken_that_is_contradicted_less() {
         // Strength of the true pairs, matches of the wrong and of the true ones, and whether the wrong pair is put off.
         for (true_strength, wrong, right, is_found) in
             [(0.07, 20, 100, true), (0.02, 20, 100, false), (0.07, 80, 100, false), (0.1, 80, 100, true)]
