@@ -34,8 +34,7 @@ pub(super) struct Suspect {
 /// contradicted less is taken. (Fifty photographs around a toy fox were torn by a wrong pair of 90 matches that came just before
 /// true ones of 213 and 239.)
 pub(super) fn suspects(input: &MapperInput, options: &LookAlikeOptions, keep_going: &KeepGoing) -> Vec<Suspect> {
-    let found =
-        strengths(input, options, keep_going).and_then(|of| least_contradicted(input, &of, options, keep_going));
+    let found = strengths(input, options, keep_going).and_then(|of| least_contradicted(input, of, options, keep_going));
     let mut suspects = found.unwrap_or_default();
     if !suspects.iter().any(|suspect| suspect.contradicted(options.alarming_share)) {
         return Vec::new();
@@ -51,7 +50,7 @@ type Strengths = BTreeMap<(ImageId, ImageId), f64>;
 /// says no.
 fn least_contradicted(
     input: &MapperInput,
-    strengths: &Strengths,
+    mut strengths: Strengths,
     options: &LookAlikeOptions,
     keep_going: &KeepGoing,
 ) -> Option<Vec<Suspect>> {
@@ -61,7 +60,6 @@ fn least_contradicted(
         let all = suspects.iter().filter(|suspect| suspect.contradicted(options.alarming_share));
         all.map(|suspect| suspect.matches * suspect.matches).sum()
     };
-    let mut strengths = strengths.clone();
     let mut found = put_off(input, &strengths, options, keep_going)?;
     let mut tried = BTreeSet::new();
     for _ in 0..options.max_rivals {
@@ -202,10 +200,9 @@ fn weaker(a: Option<Link>, b: Option<Link>) -> Option<Link> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::{Camera, CameraModel, FocalSource, Pixel};
-    use crate::coarse::{MapperImage, MatchGraph};
-    use crate::matching::two_view::{TwoViewConfig, TwoViewGeometry};
-    use crate::scene::{ApartImages, CameraId, KeypointIdx};
+    use crate::camera::Pixel;
+    use crate::coarse::look_alikes::tests::matched_input;
+    use crate::scene::KeypointIdx;
 
     #[test]
     fn the_weakest_link_of_the_strongest_chain_is_found() {
@@ -227,38 +224,18 @@ mod tests {
     /// Four photographs in two parts, 0 with 1 and 2 with 3, each keypoint k of which shows place k; a wrong pair joins 1
     /// and 2, and true ones the others.
     fn two_parts(wrong_matches: u32, true_matches: u32) -> MapperInput {
-        let pair = |matches: u32, shift: u32| TwoViewGeometry {
-            config: TwoViewConfig::Planar,
-            inliers: (0..matches).map(|k| (KeypointIdx(k), KeypointIdx(k + shift))).collect(),
-            fundamental: None,
-            essential: None,
-            homography: None,
-            b_from_a: None,
-            median_triangulation_angle_rad: None,
-            num_e_inliers: 0,
-            num_f_inliers: 0,
-            num_h_inliers: 0,
+        let pair = |a: u32, b: u32, matches: u32, shift: u32| {
+            let inliers = (0..matches).map(|k| (KeypointIdx(k), KeypointIdx(k + shift))).collect();
+            ((ImageId(a), ImageId(b)), inliers)
         };
-        let mut graph = MatchGraph::default();
-        for (a, b, matches, shift) in [
-            (0, 1, 200, 0),
-            (2, 3, 200, 0),
-            (1, 2, wrong_matches, 100),
-            (0, 2, true_matches, 0),
-            (1, 3, true_matches, 0),
-        ] {
-            graph.pairs.insert((ImageId(a), ImageId(b)), pair(matches, shift));
-        }
-        let camera = Camera::centered(CameraModel::SimpleRadial, 1000, 800, 900.0, FocalSource::Exif);
-        let keypoints: std::sync::Arc<[Pixel]> = vec![Pixel::new(0.0, 0.0); 400].into();
-        let images = (0..4)
-            .map(|id| (ImageId(id), MapperImage { camera: CameraId(0), keypoints: std::sync::Arc::clone(&keypoints) }));
-        MapperInput {
-            images: images.collect(),
-            cameras: BTreeMap::from([(CameraId(0), camera)]),
-            graph,
-            apart: ApartImages::default(),
-        }
+        let pairs = [
+            pair(0, 1, 200, 0),
+            pair(2, 3, 200, 0),
+            pair(1, 2, wrong_matches, 100),
+            pair(0, 2, true_matches, 0),
+            pair(1, 3, true_matches, 0),
+        ];
+        matched_input((1000, 800), vec![vec![Pixel::new(0.0, 0.0); 400]; 4], pairs)
     }
 
     #[test]
@@ -281,7 +258,7 @@ mod tests {
                     ((a, b), strength)
                 })
                 .collect();
-            let found = least_contradicted(&input, &strengths, &LookAlikeOptions::default(), &|| true).unwrap();
+            let found = least_contradicted(&input, strengths, &LookAlikeOptions::default(), &|| true).unwrap();
             let found: Vec<(u32, u32)> = found.iter().map(|suspect| (suspect.images.0.0, suspect.images.1.0)).collect();
             let wanted = if is_found { vec![(1, 2)] } else { vec![(0, 2), (1, 3)] };
             assert_eq!(found, wanted, "{true_strength} {wrong} {right}");

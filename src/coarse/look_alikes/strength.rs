@@ -204,10 +204,8 @@ fn pairs_of_keypoints(input: &MapperInput, keep_going: &KeepGoing) -> Option<BTr
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::{Camera, CameraModel, FocalSource, Pixel};
-    use crate::coarse::{MapperImage, MatchGraph};
-    use crate::matching::two_view::{TwoViewConfig, TwoViewGeometry};
-    use crate::scene::{ApartImages, CameraId};
+    use crate::camera::Pixel;
+    use crate::coarse::look_alikes::tests::matched_input;
 
     const SIZE_PX: (u32, u32) = (1000, 800);
 
@@ -233,7 +231,7 @@ mod tests {
             patches.iter().flat_map(of_patch).collect()
         };
         let shown: Vec<Vec<(Look, Pixel)>> = photographs.iter().map(|patches| features(patches)).collect();
-        let mut graph = MatchGraph::default();
+        let mut pairs = Vec::new();
         for (a, in_a) in shown.iter().enumerate() {
             for (b, in_b) in shown.iter().enumerate().skip(a + 1) {
                 let same = |(at, (feature, _)): (usize, &(Look, Pixel))| {
@@ -242,33 +240,12 @@ mod tests {
                 };
                 let inliers: Vec<_> = in_a.iter().enumerate().filter_map(same).collect();
                 if !inliers.is_empty() {
-                    let geometry = TwoViewGeometry {
-                        config: TwoViewConfig::Planar,
-                        inliers,
-                        fundamental: None,
-                        essential: None,
-                        homography: None,
-                        b_from_a: None,
-                        median_triangulation_angle_rad: None,
-                        num_e_inliers: 0,
-                        num_f_inliers: 0,
-                        num_h_inliers: 0,
-                    };
-                    graph.pairs.insert((ImageId(a as u32), ImageId(b as u32)), geometry);
+                    pairs.push(((ImageId(a as u32), ImageId(b as u32)), inliers));
                 }
             }
         }
-        let camera = Camera::centered(CameraModel::SimpleRadial, SIZE_PX.0, SIZE_PX.1, 900.0, FocalSource::Exif);
-        let images = shown.iter().enumerate().map(|(id, features)| {
-            let keypoints = features.iter().map(|(_, at)| *at).collect();
-            (ImageId(id as u32), MapperImage { camera: CameraId(0), keypoints })
-        });
-        let input = MapperInput {
-            images: images.collect(),
-            cameras: BTreeMap::from([(CameraId(0), camera)]),
-            graph,
-            apart: ApartImages::default(),
-        };
+        let keypoints = shown.iter().map(|features| features.iter().map(|(_, at)| *at).collect()).collect();
+        let input = matched_input(SIZE_PX, keypoints, pairs);
         strengths(&input, &LookAlikeOptions::default(), &|| true).unwrap()
     }
 

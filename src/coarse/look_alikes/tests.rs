@@ -9,9 +9,37 @@ use super::*;
 use crate::camera::{Camera, CameraModel, FocalSource, Pixel};
 use crate::coarse::MapperImage;
 use crate::geometry::Rigid3;
-use crate::matching::two_view::{TwoViewOptions, verify};
+use crate::matching::two_view::{TwoViewConfig, TwoViewGeometry, TwoViewOptions, verify};
 use crate::math::Rng;
 use crate::scene::{CameraId, KeypointIdx, Observation};
+
+/// Photographs of one camera with these keypoints and inliers, of whose geometry nothing else is known.
+pub(super) fn matched_input(
+    (width, height): (u32, u32),
+    keypoints: Vec<Vec<Pixel>>,
+    pairs: impl IntoIterator<Item = ((ImageId, ImageId), Vec<(KeypointIdx, KeypointIdx)>)>,
+) -> MapperInput {
+    let geometry = |inliers| TwoViewGeometry {
+        config: TwoViewConfig::Planar,
+        inliers,
+        fundamental: None,
+        essential: None,
+        homography: None,
+        b_from_a: None,
+        median_triangulation_angle_rad: None,
+        num_e_inliers: 0,
+        num_f_inliers: 0,
+        num_h_inliers: 0,
+    };
+    let camera = Camera::centered(CameraModel::SimpleRadial, width, height, 900.0, FocalSource::Exif);
+    let images = (0..).map(ImageId).zip(keypoints);
+    MapperInput {
+        images: images.map(|(id, at)| (id, MapperImage { camera: CameraId(0), keypoints: at.into() })).collect(),
+        cameras: BTreeMap::from([(CameraId(0), camera)]),
+        graph: MatchGraph { pairs: pairs.into_iter().map(|(pair, inliers)| (pair, geometry(inliers))).collect() },
+        apart: ApartImages::default(),
+    }
+}
 
 /// A surface point; those of one look can't be told apart.
 struct SurfacePoint {
