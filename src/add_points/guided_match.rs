@@ -16,6 +16,7 @@ use std::f64::consts::{PI, TAU};
 
 use serde::{Deserialize, Serialize};
 
+use super::candidate_search::CandidateSearch;
 use super::epipolar::EpipolarGeometry;
 use super::one_way::{Found, OneWay};
 use super::options::GuidedMatchOptions;
@@ -62,11 +63,18 @@ pub fn guided_match(
         first_settled[a.index()] = true;
         second_settled[b.index()] = true;
     }
-    let open = first.finder.members().iter().copied().filter(|&query| !first_settled[query as usize]);
+    let open = |query: u32| !first_settled[query as usize];
     let mut search = OneWay { query: first, target: second, geometry: &geometry, options, check_ratio: true };
-    let mut matches = search.run(open, stream(first_id, second_id));
+    // One sweep tells both ways; but the way back's ratio test needs a way back.
+    let at_once = options.mutual && options.search == CandidateSearch::Sweep && !options.ratio_both_ways;
+    let rng = stream(first_id, second_id);
+    let mut matches = if at_once {
+        search.run_mutual(open, rng)
+    } else {
+        search.run(first.finder.members().iter().copied().filter(|&query| open(query)), rng)
+    };
     matches.retain(|found| !second_settled[found.target as usize]);
-    if options.mutual {
+    if options.mutual && !at_once {
         let mut asked: Vec<u32> = matches.iter().map(|found| found.target).collect();
         asked.sort_unstable();
         asked.dedup();
@@ -77,7 +85,7 @@ pub fn guided_match(
             let at = back.binary_search_by_key(&found.target, |returned| returned.query);
             at.is_ok_and(|at| back[at].target == found.query)
         });
-    } else {
+    } else if !options.mutual {
         keep_best_per_target(&mut matches);
     }
     gate_by_geometry(&mut matches, first, second, &geometry, options);

@@ -3,6 +3,11 @@
 //!
 //! Two ways: a sweep of all queries' bands ([`super::sweep`]), or, as the paper has it, the queries in groups with a
 //! common line whose candidates are gathered once ([`super::line_groups`], [`super::candidate_search`]).
+//!
+//! A sweep sees the distance of every query from every candidate, so it also tells which query is nearest to a candidate:
+//! whether a match is mutual needs no way back.
+
+use nalgebra::Vector2;
 
 use super::candidate_search::{CandidateSearch, SeenMarks};
 use super::epipolar::{BoundingBox, EpipolarGeometry, EpipolarLine};
@@ -12,8 +17,8 @@ use super::prepared::PreparedImage;
 use super::sweep::Sweep;
 use crate::camera::Normalized;
 use crate::matching::descriptor::{
-    BandQuery, BandTop2, BandedRows, PackedDescriptors, Top2, distance_sq, least_distance_sq, nearest_off_bands, top2,
-    top2_in_bands,
+    BandQuery, BandTop2, BandedRows, NearestQueries, PackedDescriptors, Top2, distance_sq, least_distance_sq,
+    nearest_off_bands, top2, top2_in_bands,
 };
 use crate::math::Rng;
 use crate::scene::Descriptor;
@@ -49,34 +54,61 @@ impl OneWay<'_> {
     /// The matches of these queries, by query. `rng` chooses the rivals of small candidate sets.
     pub fn run(&self, queries: impl Iterator<Item = u32>, mut rng: Rng) -> Vec<Found> {
         let Some(bounds) = self.target.finder.bounds() else { return Vec::new() };
-        let clearance_px = self.options.epipole_clearance_bands * self.options.band_px * self.query.px_scale;
-        let epipole = self.geometry.epipole_in_query();
-        let clear = queries
-            .filter(|&q| epipole.is_none_or(|e| (self.query.finder.positions()[q as usize] - e).norm() >= clearance_px))
-            .map(|q| (q, self.query.normalized[q as usize]));
         let mut found = match self.options.search {
-            CandidateSearch::Sweep => self.by_sweep(clear, &bounds, &mut rng),
-            _ => self.by_groups(clear, &bounds, &mut rng),
+            CandidateSearch::Sweep => self.by_sweep(queries, &bounds, |_, _, _| true, &mut rng),
+            _ => self.by_groups(queries, &bounds, &mut rng),
         };
         found.sort_unstable_by_key(|found| found.query);
         found
+    }
+
+    /// By a sweep, the matches of the queries that `open` names, by query, as far as no other query is nearer to the target.
+    /// All queries compete for the targets. A target too near to its epipole has no match, as it would have none if it asked.
+    pub fn run_mutual(&self, open: impl Fn(u32) -> bool, mut rng: Rng) -> Vec<Found> {
+        let Some(bounds) = self.target.finder.bounds() else { return Vec::new() };
+        let queries = self.query.finder.members().iter().copied();
+        let epipole = self.geometry.epipole_in_target();
+        let epipole = (epipole.z != 0.0).then(|| epipole.xy() / epipole.z);
+        let is_mutual = |query: (usize, u32), target: (u32, u32), nearest: &NearestQueries| {
+            nearest.of(target.0) == Some(query.0) && open(query.1) && self.is_clear(self.target, epipole, target.1)
+        };
+        let mut found = self.by_sweep(queries, &bounds, is_mutual, &mut rng);
+        found.sort_unstable_by_key(|found| found.query);
+        found
+    }
+
+    /// Whether a feature of either image is far enough from the image's epipole for its line to say something.
+    fn is_clear(&self, image: &PreparedImage, epipole: Option<Vector2<f64>>, feature: u32) -> bool {
+        let clearance_px = self.options.epipole_clearance_bands * self.options.band_px * image.px_scale;
+        epipole.is_none_or(|e| (image.finder.positions()[feature as usize] - e).norm() >= clearance_px)
+    }
+
+    /// Those of the queries that are clear of the epipole, with their positions.
+    fn clear(&self, queries: impl Iterator<Item = u32>) -> impl Iterator<Item = (u32, Normalized)> {
+        let epipole = self.geometry.epipole_in_query();
+        let clear = queries.filter(move |&query| self.is_clear(self.query, epipole, query));
+        clear.map(|query| (query, self.query.normalized[query as usize]))
     }
 
     fn band_px(&self) -> f64 {
         self.options.band_px * self.target.px_scale
     }
 
+    /// The matches of the queries by a sweep. A query (its rank and feature) and its nearest candidate (its slot and feature)
+    /// are judged only where they are `wanted`, given which query is nearest to each slot.
     fn by_sweep(
         &self,
-        queries: impl Iterator<Item = (u32, Normalized)>,
+        queries: impl Iterator<Item = u32>,
         bounds: &BoundingBox,
+        wanted: impl Fn((usize, u32), (u32, u32), &NearestQueries) -> bool,
         rng: &mut Rng,
     ) -> Vec<Found> {
         let (target, band_px) = (self.target, self.band_px());
         let (positions, members) = (target.finder.positions(), target.finder.members());
         let descriptors = &target.features.descriptors;
         let sweep = Sweep::new(&self.geometry.epipole_in_target(), bounds, positions, descriptors, members);
-        let mut asked: Vec<_> = queries
+        let mut asked: Vec<_> = self
+            .clear(queries)
             .filter_map(|(query, at)| {
                 let coefficients = self.geometry.line_coefficients(&at);
                 let line = EpipolarLine::from_coefficients(&coefficients)?;
@@ -91,8 +123,13 @@ impl OneWay<'_> {
             bands.push(sweep.query(&self.query.features.descriptors[*query as usize], line, band_px));
             sweep.windows(of_pencil, band_px, &mut cursor, &mut windows);
         }
-        let mut nearest = Vec::new();
-        top2_in_bands(&bands, &windows, sweep.rows(), &mut nearest);
+        let (mut nearest, mut of_rows) = (Vec::new(), NearestQueries::default());
+        top2_in_bands(&bands, &windows, sweep.rows(), &mut nearest, &mut of_rows);
+        for (at, (nearest, &(_, _, query))) in nearest.iter_mut().zip(&asked).enumerate() {
+            nearest.nearest = nearest.nearest.filter(|&(slot, _)| {
+                sweep.feature(slot).is_some_and(|feature| wanted((at, query), (slot, feature), &of_rows))
+            });
+        }
         let rivals = self.random_rivals(&sweep, &bands, &nearest, rng);
 
         let per_line = sweep.windows_per_line();
@@ -149,15 +186,10 @@ impl OneWay<'_> {
         rivals
     }
 
-    fn by_groups(
-        &self,
-        queries: impl Iterator<Item = (u32, Normalized)>,
-        bounds: &BoundingBox,
-        rng: &mut Rng,
-    ) -> Vec<Found> {
+    fn by_groups(&self, queries: impl Iterator<Item = u32>, bounds: &BoundingBox, rng: &mut Rng) -> Vec<Found> {
         let band_px = self.band_px();
         let tolerance_px = self.options.group_tolerance_px * self.target.px_scale;
-        let groups = group_by_line(self.geometry, queries, &bounds.grown(band_px), tolerance_px);
+        let groups = group_by_line(self.geometry, self.clear(queries), &bounds.grown(band_px), tolerance_px);
         let pads = Padding::new(self.target.finder.members(), rng);
         let (mut marks, mut rows) = (SeenMarks::default(), Vec::new());
         let (mut packed, mut nearest) = (PackedDescriptors::new(), Vec::new());

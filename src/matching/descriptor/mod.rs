@@ -33,7 +33,7 @@ mod tier;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
-pub use banded::{BandQuery, BandTop2, BandedRows, nearest_off_bands, top2_in_bands};
+pub use banded::{BandQuery, BandTop2, BandedRows, NearestQueries, nearest_off_bands, top2_in_bands};
 pub use packed::PackedDescriptors;
 pub use tier::Tier;
 

@@ -192,6 +192,12 @@ fn every_tier_agrees_on_bands() {
                 }
             })
             .collect();
+        let expected_of_rows: Vec<Option<usize>> = (0..num_rows)
+            .map(|r| {
+                let near = (0..bands.len()).filter(|&q| bands[q].contains(positions[r][0], positions[r][1]));
+                near.min_by_key(|&q| distance_sq(bands[q].descriptor, &descriptors[r]))
+            })
+            .collect();
         let expected_off: Vec<Option<u32>> = bands
             .iter()
             .zip(&ranks)
@@ -202,9 +208,11 @@ fn every_tier_agrees_on_bands() {
             })
             .collect();
         for &tier in Tier::ALL.iter().filter(|tier| tier.is_available()) {
-            let (mut found, mut off) = (Vec::new(), Vec::new());
-            tier.top2_in_bands(&bands, &windows, &rows, &mut found);
+            let (mut found, mut of_rows, mut off) = (Vec::new(), NearestQueries::default(), Vec::new());
+            tier.top2_in_bands(&bands, &windows, &rows, &mut found, &mut of_rows);
             assert_eq!(found, expected, "{tier:?} {num_queries} {num_rows}");
+            let of_rows: Vec<Option<usize>> = slots.iter().map(|&slot| of_rows.of(slot)).collect();
+            assert_eq!(of_rows, expected_of_rows, "{tier:?} {num_queries} {num_rows}");
             tier.nearest_off_bands(&bands, &ranks, &rows, &mut off);
             assert_eq!(off, expected_off, "{tier:?} {num_queries} {num_rows}");
         }

@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::LazyLock;
 
-use super::banded::{self, BandQuery, BandTop2, BandedRows};
+use super::banded::{self, BandQuery, BandTop2, BandedRows, NearestQueries};
 use super::scalar::{self, Scalar};
 use super::{PackedDescriptors, Top2, kernel};
 use crate::scene::Descriptor;
@@ -145,20 +145,21 @@ impl Tier {
         windows: &[Range<u32>],
         rows: &BandedRows,
         out: &mut Vec<BandTop2>,
+        of_rows: &mut NearestQueries,
     ) {
         self.assert_available();
         // SAFETY: the instructions are there.
         unsafe {
             match self {
-                Self::Scalar => banded::scan::<Scalar, 4>(queries, windows, rows, out),
+                Self::Scalar => banded::scan::<Scalar, 4>(queries, windows, rows, out, of_rows),
                 #[cfg(target_arch = "x86_64")]
-                Self::Avx2 => x86::in_bands_avx2(queries, windows, rows, out),
+                Self::Avx2 => x86::in_bands_avx2(queries, windows, rows, out, of_rows),
                 #[cfg(target_arch = "x86_64")]
-                Self::AvxVnni => x86::in_bands_avx_vnni(queries, windows, rows, out),
+                Self::AvxVnni => x86::in_bands_avx_vnni(queries, windows, rows, out, of_rows),
                 #[cfg(target_arch = "x86_64")]
-                Self::Avx512Vnni => x86::in_bands_avx512_vnni(queries, windows, rows, out),
+                Self::Avx512Vnni => x86::in_bands_avx512_vnni(queries, windows, rows, out, of_rows),
                 #[cfg(target_arch = "aarch64")]
-                Self::Neon => banded::scan::<super::neon::Neon, 6>(queries, windows, rows, out),
+                Self::Neon => banded::scan::<super::neon::Neon, 6>(queries, windows, rows, out, of_rows),
             }
         }
     }
@@ -201,7 +202,7 @@ impl Tier {
 mod x86 {
     use std::ops::Range;
 
-    use super::super::banded::{self, BandQuery, BandTop2, BandedRows};
+    use super::super::banded::{self, BandQuery, BandTop2, BandedRows, NearestQueries};
     use super::super::x86::{Avx2, Avx512Vnni, AvxVnni};
     use super::super::{PackedDescriptors, Top2, kernel, scalar};
     use crate::scene::Descriptor;
@@ -235,9 +236,10 @@ mod x86 {
                 windows: &[Range<u32>],
                 rows: &BandedRows,
                 out: &mut Vec<BandTop2>,
+                of_rows: &mut NearestQueries,
             ) {
                 // SAFETY: this function is only called on machines that have its features.
-                unsafe { banded::scan::<$kernel, $queries>(queries, windows, rows, out) }
+                unsafe { banded::scan::<$kernel, $queries>(queries, windows, rows, out, of_rows) }
             }
 
             #[target_feature(enable = $features)]

@@ -19,14 +19,12 @@ use crate::scene::Descriptor;
 /// 256-bit vectors of AVX2, without byte dot products.
 pub(in super::super) struct Avx2;
 
-/// A query for both ways.
+/// A query for both ways. No more than the short way needs, as queries are prepared almost as often as they are scanned.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx2Query {
-    /// For every quad its even bytes and its odd bytes, less 128, two 16-bit numbers to an integer.
-    long: [[i32; 2]; QUADS],
-    /// The bytes less 64, four to an integer.
+    /// The bytes less 64, modulo 256, four to an integer: the signed factors of the short way, where they fit.
     short: [i32; QUADS],
-    /// The largest of these, either way; beyond all bounds where a byte does not fit.
+    /// The largest of them, either way; beyond all bounds where a byte does not fit.
     most: i32,
 }
 
@@ -37,16 +35,11 @@ unsafe impl Kernel for Avx2 {
 
     #[inline(always)]
     fn prepare(query: &Descriptor) -> Self::Query {
-        let signed = |at: usize| i32::from(query[at]) - i32::from(QUERY_OFFSET);
-        let pair = |low: usize| (signed(low) & 0xffff) | (signed(low + 2) << 16);
-        let less = |byte: u8| i32::from(byte) - i32::from(SHORT_OFFSET);
-        let most = query.iter().fold(0, |most, &byte| less(byte).abs().max(most));
+        let short = query.map(|byte| byte.wrapping_sub(SHORT_OFFSET));
+        let most = query.iter().fold(0, |most, byte| byte.abs_diff(SHORT_OFFSET).max(most));
         Avx2Query {
-            long: std::array::from_fn(|quad| [pair(4 * quad), pair(4 * quad + 1)]),
-            short: std::array::from_fn(|quad| {
-                i32::from_le_bytes(std::array::from_fn(|byte| less(query[4 * quad + byte]) as u8))
-            }),
-            most: if most <= i32::from(i8::MAX) { most } else { i32::from(i16::MAX) + 1 },
+            short: std::array::from_fn(|quad| i32::from_le_bytes(short.as_chunks().0[quad])),
+            most: if most <= i8::MAX as u8 { i32::from(most) } else { i32::from(i16::MAX) + 1 },
         }
     }
 
@@ -117,6 +110,7 @@ unsafe fn long_dots<const Q: usize, const G: usize>(
     // SAFETY: a line is twice 32 aligned bytes; the instructions are the caller's matter.
     unsafe {
         let even_bytes = _mm256_set1_epi16(0xff);
+        let (short_offset, offset) = (_mm256_set1_epi8(SHORT_OFFSET as i8), _mm256_set1_epi16(i16::from(QUERY_OFFSET)));
         let mut sums = [[[_mm256_setzero_si256(); 2]; G]; Q];
         for quad in 0..QUADS {
             for g in 0..G {
@@ -125,7 +119,9 @@ unsafe fn long_dots<const Q: usize, const G: usize>(
                 let even: [__m256i; 2] = std::array::from_fn(|h| _mm256_and_si256(rows[h], even_bytes));
                 let odd: [__m256i; 2] = std::array::from_fn(|h| _mm256_srli_epi16::<8>(rows[h]));
                 for q in 0..Q {
-                    let [query_even, query_odd] = queries[q].long[quad].map(|pair| _mm256_set1_epi32(pair));
+                    let bytes = _mm256_add_epi8(_mm256_set1_epi32(queries[q].short[quad]), short_offset);
+                    let query_even = _mm256_sub_epi16(_mm256_and_si256(bytes, even_bytes), offset);
+                    let query_odd = _mm256_sub_epi16(_mm256_srli_epi16::<8>(bytes), offset);
                     for h in 0..2 {
                         let products = _mm256_add_epi32(
                             _mm256_madd_epi16(even[h], query_even),
