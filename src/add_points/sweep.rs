@@ -76,7 +76,12 @@ impl Sweep {
             of_rings[ring].push((turn, feature));
             least_reach[ring] = reach.min(least_reach[ring]);
         }
-        let mut sweep = Self { pencil, rows: BandedRows::default(), features: Vec::new(), rings: Vec::new() };
+        let mut sweep = Self {
+            pencil,
+            rows: BandedRows::with_room(members.len(), MAX_RINGS),
+            features: Vec::new(),
+            rings: Vec::new(),
+        };
         for (mut members, least_reach) in of_rings.into_iter().zip(least_reach) {
             if members.is_empty() {
                 continue;

@@ -96,18 +96,21 @@ impl<'a> Collector<'a> {
     }
 
     /// The kept features, sorted. Two extrema that were refined to the same place count once.
-    pub(super) fn finish(mut self) -> Features {
-        self.found.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| by_scale(&a.1, &b.1)));
-        self.found.dedup_by(|a, b| a.1 == b.1);
-        let distinct = self.found.partition_point(|found| found.0 == Class::Distinct);
-        let faint: Vec<_> = self.found.split_off(distinct);
-        self.found.truncate(self.limit);
-        let room = self.faint_up_to.saturating_sub(self.found.len());
-        self.found.extend(faint.into_iter().take(room));
-        self.found.sort_by(|a, b| by_scale(&a.1, &b.1));
-        let (keypoints, descriptors) =
-            self.found.into_iter().map(|(_, keypoint, descriptor)| (keypoint, descriptor)).unzip();
-        Features { keypoints, descriptors }
+    pub(super) fn finish(self) -> Features {
+        // Without the descriptors, which make up most of what sorting would move.
+        let mut ranked: Vec<(Class, Keypoint, usize)> =
+            self.found.iter().enumerate().map(|(at, &(class, keypoint, _))| (class, keypoint, at)).collect();
+        ranked.sort_unstable_by(|a, b| a.0.cmp(&b.0).then_with(|| by_scale(&a.1, &b.1)).then(a.2.cmp(&b.2)));
+        ranked.dedup_by(|a, b| a.1 == b.1);
+        let faint = ranked.split_off(ranked.partition_point(|found| found.0 == Class::Distinct));
+        ranked.truncate(self.limit);
+        let room = self.faint_up_to.saturating_sub(ranked.len());
+        ranked.extend(faint.into_iter().take(room));
+        ranked.sort_unstable_by(|a, b| by_scale(&a.1, &b.1).then(a.2.cmp(&b.2)));
+        Features {
+            keypoints: ranked.iter().map(|found| found.1).collect(),
+            descriptors: ranked.iter().map(|found| self.found[found.2].2).collect(),
+        }
     }
 }
 

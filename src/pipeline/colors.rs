@@ -10,14 +10,14 @@ use super::features::ImageFeatures;
 use super::runner::{StageProgress, io_error};
 use super::state::PipelineState;
 use super::{Context, PipelineError, Stage};
-use crate::formats::photograph::{self, Decoded};
-use crate::scene::{Features, ImageId, RgbImage};
+use crate::formats::photograph::{self, Colors};
+use crate::scene::{Features, ImageId};
 use crate::store::ArtifactStore;
 
 /// Small JPEGs by image.
 pub type Thumbnails = BTreeMap<ImageId, Vec<u8>>;
 
-/// Long side of a decoding for colours: finer detail than this does not change a point's colour.
+/// Least long side of a raster for colours: finer detail than this does not change a point's colour.
 pub(super) const COLOR_LONG_SIDE_PX: u32 = 1600;
 /// Long side of a thumbnail.
 const THUMBNAIL_LONG_SIDE_PX: u32 = 240;
@@ -35,11 +35,10 @@ pub(super) struct Look {
 
 impl Look {
     /// Of a decoded photograph, at its features (in pixels of the original).
-    pub(super) fn of(picture: Decoded<RgbImage>, features: &Features) -> Self {
-        let Decoded { image, to_original: [across, down] } = picture;
-        let at = |x: f32, y: f32| image.at(f64::from(x) / across, f64::from(y) / down);
+    pub(super) fn of(picture: Colors, features: &Features) -> Self {
+        let at = |x: f32, y: f32| picture.at(f64::from(x), f64::from(y));
         let colors = features.keypoints.iter().map(|keypoint| at(keypoint.x, keypoint.y)).collect();
-        let small = photograph::shrink_rgb(image, Some(THUMBNAIL_LONG_SIDE_PX)).image;
+        let small = picture.thumbnail(THUMBNAIL_LONG_SIDE_PX);
         // Encoding into memory has no reason to fail; without a thumbnail the report shows a blank.
         Self { colors, thumbnail: photograph::encode_jpeg(&small, THUMBNAIL_QUALITY).unwrap_or_default() }
     }

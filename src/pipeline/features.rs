@@ -106,7 +106,7 @@ fn extract_one(
     let path = folder.join(&file.name);
     let bytes = std::fs::read(&path).map_err(|source| io_error(Stage::Features, &path, source))?;
     let decoded = Photograph::open(&bytes, &options.intake.limits()).and_then(|photograph| {
-        photograph.decode_gray_and_rgb(Some(options.intake.max_long_side_px), Some(COLOR_LONG_SIDE_PX))
+        photograph.decode_gray_and_colors(Some(options.intake.max_long_side_px), Some(COLOR_LONG_SIDE_PX))
     });
     let (decoded, picture) = match decoded {
         Ok(decoded) => decoded,

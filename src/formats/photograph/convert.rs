@@ -32,14 +32,12 @@ pub(super) fn gray_to_rgb(image: &GrayImage) -> RgbImage {
     RgbImage::new(image.width, image.height, image.data.iter().flat_map(|&v| [v; 3]).collect())
 }
 
-/// The colours of JPEG files (ITU-T T.871, section 7) to RGB, in place, in units of 2^-16.
-pub(super) fn ycbcr_to_rgb(data: &mut [u8]) {
+/// A colour of a JPEG file (ITU-T T.871, section 7) to RGB, in units of 2^-16.
+pub(super) fn ycbcr_to_rgb(color: [u8; 3]) -> [u8; 3] {
     let byte = |value: i32| ((value + (1 << 15)) >> 16).clamp(0, 255) as u8;
-    for pixel in data.as_chunks_mut::<3>().0 {
-        let [y, cb, cr] = pixel.map(i32::from);
-        let (y, cb, cr) = (y << 16, cb - 128, cr - 128);
-        *pixel = [byte(y + 91_881 * cr), byte(y - 22_554 * cb - 46_802 * cr), byte(y + 116_130 * cb)];
-    }
+    let [y, cb, cr] = color.map(i32::from);
+    let (y, cb, cr) = (y << 16, cb - 128, cr - 128);
+    [byte(y + 91_881 * cr), byte(y - 22_554 * cb - 46_802 * cr), byte(y + 116_130 * cb)]
 }
 
 /// Grey of anything; alpha is ignored.
@@ -93,13 +91,28 @@ pub(super) fn shrink_gray(image: GrayImage, max_long_side: Option<u32>) -> Decod
     }
 }
 
-/// Reduces the longer side to `max_long_side`, where it is longer, by averaging boxes of whole pixels: colours and thumbnails
-/// need no better, and it costs little more than reading the raster.
-pub fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbImage> {
+/// Reduces the longer side to `max_long_side`, where it is longer, by averaging boxes of whole pixels.
+pub(super) fn shrink_rgb(image: RgbImage, max_long_side: Option<u32>) -> Decoded<RgbImage> {
+    match reduced_size(image.width, image.height, max_long_side) {
+        Some(size) => average_boxes(&image, size),
+        None => Decoded { image, to_original: [1.0, 1.0] },
+    }
+}
+
+/// Reduces both sides by the largest whole number that leaves the longer at least `least_long_side`.
+pub(super) fn shrink_rgb_by_whole(image: RgbImage, least_long_side: Option<u32>) -> Decoded<RgbImage> {
     let (width, height) = (image.width, image.height);
-    let Some((new_width, new_height)) = reduced_size(width, height, max_long_side) else {
+    let by = least_long_side.map_or(1, |least| (width.max(height) / (least as usize).max(1)).max(1));
+    if by == 1 {
         return Decoded { image, to_original: [1.0, 1.0] };
-    };
+    }
+    average_boxes(&image, ((width / by).max(1), (height / by).max(1)))
+}
+
+/// A smaller raster of the averages over boxes of whole pixels: colours and thumbnails need no better, and it costs little
+/// more than reading the raster.
+fn average_boxes(image: &RgbImage, (new_width, new_height): (usize, usize)) -> Decoded<RgbImage> {
+    let (width, height) = (image.width, image.height);
     let edge = |at: usize, new: usize, old: usize| at * old / new;
     let columns: Vec<usize> = (0..=new_width).map(|x| edge(x, new_width, width)).collect();
     let mut data = Vec::with_capacity(3 * new_width * new_height);

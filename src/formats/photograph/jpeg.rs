@@ -9,7 +9,8 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-use super::{Decoded, PhotographError, convert};
+use super::colors::StoredAs;
+use super::{PhotographError, convert};
 use crate::scene::{GrayImage, RgbImage};
 
 /// What the frame header says.
@@ -119,11 +120,8 @@ pub(super) fn decode_rgb(bytes: &[u8]) -> Result<RgbImage, PhotographError> {
     Ok(RgbImage::new(width, height, data))
 }
 
-/// Luma in full size, and colour with its longer side reduced to `max_long_side` where it is longer.
-pub(super) fn decode_gray_and_rgb(
-    bytes: &[u8],
-    max_long_side: Option<u32>,
-) -> Result<(GrayImage, Decoded<RgbImage>), PhotographError> {
+/// Luma, and colours as they are stored where those are YCbCr; both in full size.
+pub(super) fn decode_gray_and_colors(bytes: &[u8]) -> Result<(GrayImage, RgbImage, StoredAs), PhotographError> {
     let wanted = |stored| match stored {
         Some(as_stored @ (ColorSpace::YCbCr | ColorSpace::Luma)) => as_stored,
         _ => ColorSpace::RGB,
@@ -132,18 +130,15 @@ pub(super) fn decode_gray_and_rgb(
         (ColorSpace::Luma, width, height, data) => {
             let gray = GrayImage::new(width, height, data);
             let rgb = convert::gray_to_rgb(&gray);
-            Ok((gray, convert::shrink_rgb(rgb, max_long_side)))
+            Ok((gray, rgb, StoredAs::Rgb))
         }
         (ColorSpace::YCbCr, width, height, data) => {
             let gray = GrayImage::new(width, height, data.as_chunks::<3>().0.iter().map(|pixel| pixel[0]).collect());
-            // Averages commute with the change of colours, which is linear, and less remains to be changed.
-            let mut small = convert::shrink_rgb(RgbImage::new(width, height, data), max_long_side);
-            convert::ycbcr_to_rgb(&mut small.image.data);
-            Ok((gray, small))
+            Ok((gray, RgbImage::new(width, height, data), StoredAs::YCbCr))
         }
         (_, width, height, data) => {
             let rgb = RgbImage::new(width, height, data);
-            Ok((convert::rgb_to_gray(&rgb), convert::shrink_rgb(rgb, max_long_side)))
+            Ok((convert::rgb_to_gray(&rgb), rgb, StoredAs::Rgb))
         }
     }
 }

@@ -4,6 +4,7 @@
 //! completeness come from the headers and the container's structure. Decoders run behind a panic guard, as their authors'
 //! fuzzers still find panics in them. The rasters stay in the sensor's frame: the orientation tag is never applied.
 
+mod colors;
 mod convert;
 mod jpeg;
 mod sniff;
@@ -17,7 +18,9 @@ use serde::{Deserialize, Serialize};
 use super::exif::Exif;
 use crate::scene::{GrayImage, RgbImage};
 
-pub use convert::shrink_rgb;
+use colors::StoredAs;
+
+pub use colors::Colors;
 
 /// A file format, recognised by content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -198,23 +201,25 @@ impl<'a> Photograph<'a> {
         Ok(convert::shrink_rgb(image, max_long_side))
     }
 
-    /// [`Photograph::decode_gray`] and [`Photograph::decode_rgb`] from one reading of the file.
+    /// [`Photograph::decode_gray`] and the colours from one reading of the file. The colours are reduced by the largest whole
+    /// number that leaves their longer side at least `least_long_side_colors`.
     ///
     /// # Errors
     /// When the pixels can't be decoded.
-    pub fn decode_gray_and_rgb(
+    pub fn decode_gray_and_colors(
         &self,
         max_long_side_gray: Option<u32>,
-        max_long_side_rgb: Option<u32>,
-    ) -> Result<(Decoded<GrayImage>, Decoded<RgbImage>), PhotographError> {
-        let (gray, rgb) = guarded(|| match self.info.format {
-            PhotographFormat::Jpeg => jpeg::decode_gray_and_rgb(self.bytes, max_long_side_rgb),
+        least_long_side_colors: Option<u32>,
+    ) -> Result<(Decoded<GrayImage>, Colors), PhotographError> {
+        let (gray, raster, stored_as) = guarded(|| match self.info.format {
+            PhotographFormat::Jpeg => jpeg::decode_gray_and_colors(self.bytes),
             _ => {
                 let image = self.decode_dynamic()?;
-                Ok((convert::to_gray(&image), convert::shrink_rgb(convert::to_rgb(&image), max_long_side_rgb)))
+                Ok((convert::to_gray(&image), convert::to_rgb(&image), StoredAs::Rgb))
             }
         })?;
-        Ok((convert::shrink_gray(gray, max_long_side_gray), rgb))
+        let colors = Colors::new(raster, stored_as, least_long_side_colors);
+        Ok((convert::shrink_gray(gray, max_long_side_gray), colors))
     }
 
     fn decode_dynamic(&self) -> Result<DynamicImage, PhotographError> {

@@ -11,7 +11,7 @@
 use std::ops::Range;
 
 use super::kernel::{Kernel, PADDING_LIMIT, Running, block, reduce};
-use super::packed::{GROUP_ROWS, PADDING_BIAS, PackedDescriptors};
+use super::packed::{GROUP_ROWS, PADDING_BIAS, PackedDescriptors, fetch_early};
 use super::tier::Tier;
 use crate::scene::Descriptor;
 
@@ -77,6 +77,15 @@ impl BandQuery<'_> {
 }
 
 impl BandedRows {
+    /// With room for so many rows in so many sections.
+    pub fn with_room(rows: usize, sections: usize) -> Self {
+        let groups = rows.div_ceil(GROUP_ROWS) + sections;
+        let mut packed = PackedDescriptors::new();
+        packed.reserve_groups(groups);
+        let position = || Vec::with_capacity(groups * GROUP_ROWS);
+        Self { packed, x: position(), y: position() }
+    }
+
     /// Appends a section: the rows `descriptors[indices[0]], ...` with their positions. It starts at the slot
     /// [`BandedRows::slots`] before the call, with a new group.
     ///
@@ -156,6 +165,9 @@ pub(super) unsafe fn scan<K: Kernel, const Q: usize>(
     for first in (0..queries.len()).step_by(Q) {
         let used = (queries.len() - first).min(Q);
         let (prepared, norms_sq) = block::<K, Q>(used, |q| queries[first + q].descriptor);
+        for next in queries.iter().skip(first + Q).take(Q) {
+            fetch_early(next.descriptor);
+        }
         let bands: [BandQuery<'_>; Q] = std::array::from_fn(|q| queries[first + q.min(used - 1)]);
         // SAFETY: passed on to the caller.
         unsafe {

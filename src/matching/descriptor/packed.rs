@@ -107,6 +107,13 @@ impl PackedDescriptors {
         self.append(indices.len(), |row| &descriptors[indices[row] as usize]);
     }
 
+    /// Makes room for so many groups more.
+    pub(super) fn reserve_groups(&mut self, groups: usize) {
+        self.lines.reserve(groups * QUADS);
+        self.biases.reserve(groups * GROUP_ROWS);
+        self.short.reserve(groups);
+    }
+
     /// Number of rows.
     pub fn len(&self) -> usize {
         self.len
@@ -142,6 +149,9 @@ impl PackedDescriptors {
         for first in (0..len).step_by(GROUP_ROWS) {
             let rows: [&Descriptor; GROUP_ROWS] =
                 std::array::from_fn(|lane| if first + lane < len { descriptor(first + lane) } else { &EMPTY });
+            for lane in 0..GROUP_ROWS.min(len.saturating_sub(first + GROUP_ROWS)) {
+                fetch_early(descriptor(first + GROUP_ROWS + lane));
+            }
             let (mut lines, mut biases) = ([Line([[0; 4]; GROUP_ROWS]); QUADS], [0; GROUP_ROWS]);
             let short = pack_group(&rows, &mut lines, &mut biases);
             biases[(len - first).min(GROUP_ROWS)..].fill(PADDING_BIAS);
@@ -150,6 +160,23 @@ impl PackedDescriptors {
             self.short.push(short);
         }
     }
+}
+
+/// Asks for a descriptor that will be read soon. Subsets are read in an order that no cache foresees, and waiting for them took
+/// a third of the time of packing.
+#[inline(always)]
+pub(super) fn fetch_early(descriptor: &Descriptor) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let start = descriptor.as_ptr().cast::<i8>();
+        for line in (0..DESCRIPTOR_LEN).step_by(64) {
+            // SAFETY: a hint, of an address inside the descriptor.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(start.add(line)) };
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = descriptor;
 }
 
 /// The lines, biases and the rest of sixteen rows, with the fastest instructions of this machine.

@@ -40,11 +40,18 @@ fn assert_shows_the_picture(bytes: &[u8], tolerance: f64) {
     assert_eq!(gray.to_original, [1.0, 1.0]);
     let rgb = photograph.decode_rgb(None).unwrap().image;
     // Grey and colour from one reading: the same grey to the bit, the same colours but for rounding.
-    let (same_gray, same_rgb) = photograph.decode_gray_and_rgb(None, None).unwrap();
+    let (same_gray, colors) = photograph.decode_gray_and_colors(None, None).unwrap();
     assert_eq!(same_gray, gray);
-    assert!(same_rgb.image.data.iter().zip(&rgb.data).all(|(a, b)| a.abs_diff(*b) <= 3));
-    let small = photograph.decode_gray_and_rgb(None, Some(40)).unwrap().1;
-    assert_eq!((small.image.width, small.to_original), (40, [3.0, 80.0 / 27.0]));
+    let at = |x: usize, y: usize| (x as f64 + 0.5, y as f64 + 0.5);
+    let close = |a: [u8; 3], b: [u8; 3]| a.iter().zip(&b).all(|(a, b)| a.abs_diff(*b) <= 3);
+    for (x, y) in (0..HEIGHT as usize).flat_map(|y| (0..WIDTH as usize).map(move |x| at(x, y))) {
+        assert!(close(colors.at(x, y), rgb.at(x, y)), "colour at ({x}, {y})");
+    }
+    // Of 120 columns a third, as the next whole number would leave fewer than were asked for.
+    let small = photograph.decode_gray_and_colors(None, Some(35)).unwrap().1;
+    assert_eq!(small.size(), (40, 26));
+    assert!(close(small.at(61.5, 41.5), rgb.at(61.5, 41.5)));
+    assert!(close(colors.thumbnail(40).at(20.5, 13.5), rgb.at(61.5, 40.5)));
     for y in 0..HEIGHT as usize {
         for x in 0..WIDTH as usize {
             let found = f64::from(gray.image.data[y * WIDTH as usize + x]);

@@ -36,7 +36,7 @@ pub const PARSERS: [Parser; 12] = [
 fn photograph(bytes: &[u8]) {
     let limits = PhotographLimits { min_side_px: 1, max_megapixels: 1.0 };
     if let Ok(photograph) = Photograph::open(bytes, &limits) {
-        let _ = photograph.decode_gray_and_rgb(Some(64), Some(32));
+        let _ = photograph.decode_gray_and_colors(Some(64), Some(32));
     }
 }
 
