@@ -11,7 +11,9 @@
 //! 24..64  zero, so that a value that is mapped starts on a cache line
 //! ```
 //!
-//! and a file whose header does not fit its content counts as absent: the unit is simply computed again.
+//! and a file whose header does not fit its content counts as absent: the unit is simply computed again. So nobody waits for
+//! the disk when one is written. A program that crashes loses none; a power cut may cost the work of the last seconds, where
+//! waiting cost a set of ten photographs a twentieth of its time.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -73,7 +75,8 @@ impl ArtifactStore {
         Ok((value.len() == capacity && xxh3_64(&value) == word(16)).then_some(value))
     }
 
-    /// Stores a value durably; a key that has one already gets it again, whole.
+    /// Stores a value, whole for every later reader of this system and, when the power fails within seconds, whole or absent
+    /// for those of the next start. A key that has one already gets it again.
     ///
     /// # Errors
     /// What the system said, or an invalid key.
@@ -86,7 +89,7 @@ impl ArtifactStore {
         header[..8].copy_from_slice(MAGIC);
         header[8..16].copy_from_slice(&(value.len() as u64).to_le_bytes());
         header[16..24].copy_from_slice(&xxh3_64(value).to_le_bytes());
-        atomic::write_atomic(&path, &self.scratch, &[&header, value])
+        atomic::write_whole(&path, &self.scratch, &[&header, value])
     }
 
     /// Removes every value whose key starts with `folder` and a `/`; there need be none.

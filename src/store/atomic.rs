@@ -19,14 +19,26 @@ pub(crate) fn temporary_in(folder: &Path) -> io::Result<NamedTempFile> {
 
 /// Writes `parts`, one after the other, to the file `path`; the temporary file is made in `scratch` (same file system).
 pub(crate) fn write_atomic(path: &Path, scratch: &Path, parts: &[&[u8]]) -> io::Result<()> {
+    let file = written(scratch, parts)?;
+    file.as_file().sync_all()?;
+    file.persist(path).map_err(|failed| failed.error)?;
+    sync_parent(path)
+}
+
+/// [`write_atomic`] without waiting for the disk: whole or not at all for as long as the system runs, but after a power cut
+/// the name may stand for any part of the bytes, and whoever reads must find that out.
+pub(crate) fn write_whole(path: &Path, scratch: &Path, parts: &[&[u8]]) -> io::Result<()> {
+    written(scratch, parts)?.persist(path).map_err(|failed| failed.error)?;
+    Ok(())
+}
+
+fn written(scratch: &Path, parts: &[&[u8]]) -> io::Result<NamedTempFile> {
     let mut file = temporary_in(scratch)?;
     for part in parts {
         // Not through the temporary file itself, which hides the system's error in one of its own.
         file.as_file_mut().write_all(part)?;
     }
-    file.as_file().sync_all()?;
-    file.persist(path).map_err(|failed| failed.error)?;
-    sync_parent(path)
+    Ok(file)
 }
 
 /// Makes the entries of a folder durable.
