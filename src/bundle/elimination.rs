@@ -316,16 +316,20 @@ impl PartialSums {
     }
 }
 
-/// The product of three-row blocks, the rows being a pose's.
+/// The product of three-row blocks, the rows being a pose's. All of it is copied first: of what is behind references the
+/// compiler does not see that writing leaves it as it is, and computes one entry after the other.
 #[inline(always)]
 fn subtract_pose_rows(out: &mut [f64], stride: usize, columns: [&[f64]; 3], rows: [&[f64; POSE]; 3]) {
+    let [r0, r1, r2] = rows.map(|row| *row);
     for k in 0..columns[0].len() {
         let (a, b, c) = (columns[0][k], columns[1][k], columns[2][k]);
         let column: &mut [f64; POSE] =
             (&mut out[k * stride..k * stride + POSE]).try_into().expect("the slice has this length");
+        let mut sums = *column;
         for i in 0..POSE {
-            column[i] -= a * rows[0][i] + b * rows[1][i] + c * rows[2][i];
+            sums[i] -= a * r0[i] + b * r1[i] + c * r2[i];
         }
+        *column = sums;
     }
 }
 

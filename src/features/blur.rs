@@ -14,7 +14,7 @@ const WIDENINGS: usize = 8;
 pub(super) struct Kernel {
     /// The weight of the centre, then of its neighbours outwards.
     weights: Vec<f32>,
-    /// All weights from one end to the other, between [`BATCH`] - 1 zeros at either side.
+    /// All weights from one end to the other.
     spread: Vec<f32>,
 }
 
@@ -33,8 +33,7 @@ impl Kernel {
         let widened = (0..WIDENINGS).fold(sigma, |widened, _| widened * sigma / variance_of(widened).sqrt());
         let (weight, sum) = (|k: usize| weight_of(k, widened), sum_of(widened));
         let weights: Vec<f32> = (0..=radius).map(|k| (weight(k) / sum) as f32).collect();
-        let rim = [0.0; BATCH - 1];
-        let spread = rim.into_iter().chain(weights[1..].iter().rev().chain(&weights).copied()).chain(rim).collect();
+        let spread = weights[1..].iter().rev().chain(&weights).copied().collect();
         Self { weights, spread }
     }
 
@@ -72,8 +71,9 @@ pub(super) fn blur_rows(
     outs: &mut [&mut [f32]],
 ) {
     let radius = kernel.radius();
+    // Where fewer rows are left, those beyond the last are made for nothing.
     let around: Vec<&[f32]> =
-        (0..2 * radius + outs.len()).map(|at| source.row((y + at).saturating_sub(radius).min(height - 1))).collect();
+        (0..2 * radius + BATCH).map(|at| source.row((y + at).saturating_sub(radius).min(height - 1))).collect();
     let stride = padded(width) + 2 * radius;
     let mut columns: [&mut [f32]; BATCH] = scratch.columns.each_mut().map(|columns| &mut columns[..stride]);
     {
@@ -93,7 +93,8 @@ pub(super) fn extend_border(values: &mut [f32], margin: usize, width: usize) {
     values[margin + width..].fill(last);
 }
 
-/// Weighted sums of the rows `around` each of the rows `outs`; `weights` has [`BATCH`] - 1 zeros before and after.
+/// Weighted sums of the rows `around` each of the rows `outs`. The first rows add to the first sums alone, the last ones to
+/// the last, and all between them to every sum.
 ///
 /// The sums of a piece of the rows must fit the registers beside the values loaded: 32 registers of 16 floats hold
 /// pieces of 32, 16 registers of 8 floats pieces of 16 (with 32 the compiler stores and loads sums within the loop, at
@@ -132,19 +133,34 @@ fn blur_columns_body<const FMA: bool, const PIECE: usize>(
     around: &[&[f32]],
     outs: [&mut [f32]; BATCH],
 ) {
+    let taps = weights.len();
+    assert!(taps >= BATCH - 1 && around.len() == taps + BATCH - 1, "a kernel has three weights or more");
     let [out_0, out_1, out_2, out_3] = outs.map(|out| out.as_chunks_mut::<PIECE>().0);
     let pieces = out_0.iter_mut().zip(out_1).zip(out_2).zip(out_3).enumerate();
     for (at, (((out_0, out_1), out_2), out_3)) in pieces {
         // Four arrays by name, not an array of arrays: the compiler keeps only these in registers.
         let (mut sum_0, mut sum_1) = ([0.0_f32; PIECE], [0.0_f32; PIECE]);
         let (mut sum_2, mut sum_3) = ([0.0_f32; PIECE], [0.0_f32; PIECE]);
-        for (row, weights) in around.iter().zip(weights.windows(BATCH)) {
+        let piece = |row: usize| &around[row].as_chunks::<PIECE>().0[at];
+        add_weighted::<FMA, PIECE>(weights[0], piece(0), &mut sum_0);
+        add_weighted::<FMA, PIECE>(weights[1], piece(1), &mut sum_0);
+        add_weighted::<FMA, PIECE>(weights[0], piece(1), &mut sum_1);
+        add_weighted::<FMA, PIECE>(weights[2], piece(2), &mut sum_0);
+        add_weighted::<FMA, PIECE>(weights[1], piece(2), &mut sum_1);
+        add_weighted::<FMA, PIECE>(weights[0], piece(2), &mut sum_2);
+        for (row, weights) in around[BATCH - 1..taps].iter().zip(weights.windows(BATCH)) {
             let row = &row.as_chunks::<PIECE>().0[at];
             add_weighted::<FMA, PIECE>(weights[3], row, &mut sum_0);
             add_weighted::<FMA, PIECE>(weights[2], row, &mut sum_1);
             add_weighted::<FMA, PIECE>(weights[1], row, &mut sum_2);
             add_weighted::<FMA, PIECE>(weights[0], row, &mut sum_3);
         }
+        add_weighted::<FMA, PIECE>(weights[taps - 1], piece(taps), &mut sum_1);
+        add_weighted::<FMA, PIECE>(weights[taps - 2], piece(taps), &mut sum_2);
+        add_weighted::<FMA, PIECE>(weights[taps - 3], piece(taps), &mut sum_3);
+        add_weighted::<FMA, PIECE>(weights[taps - 1], piece(taps + 1), &mut sum_2);
+        add_weighted::<FMA, PIECE>(weights[taps - 2], piece(taps + 1), &mut sum_3);
+        add_weighted::<FMA, PIECE>(weights[taps - 1], piece(taps + 2), &mut sum_3);
         (*out_0, *out_1, *out_2, *out_3) = (sum_0, sum_1, sum_2, sum_3);
     }
 }
