@@ -78,9 +78,7 @@ impl StarTracks {
 
     /// Adds the stars of the image of the next rank, sorted by their queries.
     pub fn add_image(&mut self, stars: Vec<StarTrack>) {
-        for mut star in stars {
-            let query = star.sightings[0];
-            star.sightings.sort_unstable();
+        for star in stars {
             match self.same_sightings(&star.sightings) {
                 Some(at) => self.keep_better(at, &star),
                 None => {
@@ -88,7 +86,7 @@ impl StarTracks {
                         xyz: star.xyz,
                         mean_relative_error_sq: star.mean_relative_error_sq,
                         first_sighting: self.sightings.len(),
-                        query: query.keypoint,
+                        query: star.query.keypoint,
                         distinctive: star.distinctive,
                     });
                     self.sightings.extend(star.sightings);
@@ -128,8 +126,9 @@ mod tests {
     }
 
     fn star(sightings: &[Sighting], x: f64, distinctive: bool, error: f64) -> StarTrack {
-        let xyz = Vector3::new(x, 0.0, 0.0);
-        StarTrack { sightings: sightings.to_vec(), xyz, distinctive, mean_relative_error_sq: error }
+        let (xyz, query, mut sightings) = (Vector3::new(x, 0.0, 0.0), sightings[0], sightings.to_vec());
+        sightings.sort_unstable();
+        StarTrack { query, sightings, xyz, distinctive, mean_relative_error_sq: error }
     }
 
     #[test]

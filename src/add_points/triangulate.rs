@@ -32,7 +32,9 @@ pub struct PairMatches {
 /// A query keypoint and those of its matches that see one point with it.
 #[derive(Clone, Debug)]
 pub struct StarTrack {
-    /// The sightings that agree, the query's first, then by rank; one an image, two or more.
+    /// The keypoint whose matches they are.
+    pub query: Sighting,
+    /// The sightings that agree, the query's among them, sorted; one an image, two or more.
     pub sightings: Vec<Sighting>,
     /// The point.
     pub xyz: Vector3<f64>,
@@ -139,7 +141,7 @@ pub fn triangulate_star(
     let inliers = |xyz: &Vector3<f64>| -> Vec<Sighting> {
         track.iter().copied().filter(|&seen| table.relative_error_sq(seen, xyz) <= 1.0).collect()
     };
-    let (xyz, sightings) = refit(table, xyz, inliers)?;
+    let (xyz, mut sightings) = refit(table, xyz, inliers)?;
     if sightings[0] != query {
         return None;
     }
@@ -148,7 +150,8 @@ pub fn triangulate_star(
     let mut links = links.iter();
     let distinctive =
         sightings[1..].iter().all(|seen| links.find(|link| link.seen == *seen).is_some_and(|link| link.distinctive));
-    Some(StarTrack { distinctive, mean_relative_error_sq: errors / sightings.len() as f64, sightings, xyz })
+    sightings.sort_unstable();
+    Some(StarTrack { query, distinctive, mean_relative_error_sq: errors / sightings.len() as f64, sightings, xyz })
 }
 
 /// Rounds of [`refit`]: the inliers have settled after one or two.

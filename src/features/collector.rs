@@ -68,10 +68,15 @@ impl<'a> Collector<'a> {
         scales.len() < room || (room > 0 && scales.peek().is_some_and(|least| scale.to_bits() >= least.0))
     }
 
-    /// Whether all places of a class are taken by features of at least this scale.
-    pub(super) fn is_full_from(&self, class: Class, scale: f32) -> bool {
-        let (scales, room) = (&self.scales[class as usize], self.room(class));
-        scales.len() == room && scales.peek().is_none_or(|least| least.0 >= scale.to_bits())
+    /// The share of what a class is to make up that features of at least this scale do make up; faint ones are to make up
+    /// their number together with all distinct ones.
+    pub(super) fn share_from(&self, class: Class, scale: f32) -> f64 {
+        let of_scale = self.scales[class as usize].iter().filter(|kept| kept.0 >= scale.to_bits()).count();
+        let (kept, wanted) = match class {
+            Class::Distinct => (of_scale, self.limit),
+            Class::Faint => (self.scales[Class::Distinct as usize].len() + of_scale, self.faint_up_to),
+        };
+        if wanted == 0 { 1.0 } else { kept as f64 / wanted as f64 }
     }
 
     /// The keypoints of a class found so far.

@@ -53,6 +53,10 @@ const MIN_OCTAVE_SIDE: usize = 8;
 /// foretell what is worth describing in it; making their first level then costs its first blurs twice.
 const OCTAVE_0_DENSITY: f64 = 0.006;
 
+/// An octave is searched again where the features of scales that its forecast let through in every row make up less than this
+/// share of the wanted number.
+const MIN_FORETOLD_SHARE: f64 = 0.9;
+
 /// The SIFT features of an image: at most [`SiftOptions::limit`] distinct ones, those of the largest scales, and where
 /// there are fewer than [`SiftOptions::faint_up_to`], so many with faint ones.
 ///
@@ -96,14 +100,14 @@ fn extract_with(isa: Isa, image: &GrayImage, options: &SiftOptions, keeps: &dyn 
     collector.finish()
 }
 
-/// Runs an octave with a forecast from the coarser ones, and again without one where that kept too few.
+/// Runs an octave with a forecast from the coarser ones, and again without one where far too few were kept for it.
 fn run_foretold<'a>(octave: impl Fn() -> Octave<'a>, collector: &mut Collector<'_>) {
     let before = collector.clone();
     let mut forecast = Forecast::new(|class| collector.keypoints(class), collector.limit(), collector.faint_up_to());
     octave().run(collector, Some(&mut forecast));
     let is_wrong = [Class::Distinct, Class::Faint].into_iter().any(|class| {
         let complete_from = forecast.complete_from(class);
-        complete_from > 0.0 && !collector.is_full_from(class, complete_from)
+        complete_from > 0.0 && collector.share_from(class, complete_from) < MIN_FORETOLD_SHARE
     });
     if is_wrong {
         *collector = before;

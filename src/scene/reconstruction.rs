@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{ApartImages, CameraId, ImageId, KeypointIdx, Point3dId};
@@ -288,9 +289,12 @@ impl Reconstruction {
         })
     }
 
-    /// The reprojection error of every sighting of every point, image by image.
+    /// The reprojection error of every sighting of every point, image by image; images are shared out among threads.
     pub fn reprojection_errors_px(&self) -> Vec<f64> {
-        self.images.keys().flat_map(|&id| self.errors_of_image_px(id)).map(|(_, error_px)| error_px).collect()
+        let of_image =
+            |&id: &ImageId| -> Vec<f64> { self.errors_of_image_px(id).map(|(_, error_px)| error_px).collect() };
+        let of_images: Vec<Vec<f64>> = self.images.par_iter().map(|(id, _)| of_image(id)).collect();
+        of_images.concat()
     }
 
     fn error_px(&self, image: &RegisteredImage, camera: &Camera, id: Point3dId, keypoint: &Pixel) -> f64 {

@@ -49,8 +49,11 @@ fn merged(scene: &TestScene, model: &Reconstruction, stars: &[Vec<(usize, usize)
             let sight = |&(image, point): &(usize, usize)| {
                 table.sighting(&scene.observation(image, scene.keypoint_of(image, point).unwrap()))
             };
-            let sightings: Vec<_> = star.iter().map(sight).collect();
+            let mut sightings: Vec<_> = star.iter().map(sight).collect();
+            let query = sightings[0];
+            sightings.sort_unstable();
             triangulate::StarTrack {
+                query,
                 sightings,
                 xyz: scene.points[star[0].1],
                 distinctive: true,
