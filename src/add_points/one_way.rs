@@ -13,6 +13,7 @@ use super::candidate_search::{CandidateSearch, SeenMarks};
 use super::epipolar::{BoundingBox, EpipolarGeometry, EpipolarLine};
 use super::line_groups::group_by_line;
 use super::options::GuidedMatchOptions;
+use super::pencil::Turn;
 use super::prepared::PreparedImage;
 use super::sweep::Sweep;
 use crate::camera::Normalized;
@@ -107,7 +108,7 @@ impl OneWay<'_> {
         let (positions, members) = (target.finder.positions(), target.finder.members());
         let descriptors = &target.features.descriptors;
         let sweep = Sweep::new(&self.geometry.epipole_in_target(), bounds, positions, descriptors, members);
-        let mut asked: Vec<_> = self
+        let asked: Vec<_> = self
             .clear(queries)
             .filter_map(|(query, at)| {
                 let coefficients = self.geometry.line_coefficients(&at);
@@ -115,7 +116,11 @@ impl OneWay<'_> {
                 Some((sweep.pencil().line(&coefficients), line, query))
             })
             .collect();
-        asked.sort_unstable_by_key(|(of_pencil, _, query)| (of_pencil.turn, *query));
+        // Only what the order depends on is sorted, an eighth of the bytes.
+        let mut order: Vec<(Turn, u32)> =
+            asked.iter().zip(0..).map(|((of_pencil, ..), at)| (of_pencil.turn, at)).collect();
+        order.sort_unstable();
+        let asked: Vec<_> = order.into_iter().map(|(_, at)| asked[at as usize]).collect();
 
         let (mut bands, mut windows) = (Vec::with_capacity(asked.len()), Vec::new());
         let mut cursor = sweep.cursor();

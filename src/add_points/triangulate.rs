@@ -68,17 +68,22 @@ pub fn star_tracks(
         }
         Ok(stars_of_image(model, table, matches, rank as u32, &pairs_of[rank]))
     };
+    let of_images = |ranks: &[usize]| ranks.par_iter().map(|&rank| of_image(rank)).collect::<Result<Vec<_>, _>>();
     let mut stars = StarTracks::default();
     let ranks: Vec<usize> = (0..table.len()).collect();
+    let mut found = Vec::new();
     for some in ranks.chunks(IMAGES_PER_THREAD * rayon::current_num_threads()) {
-        let found: Vec<Vec<StarTrack>> = some.par_iter().map(|&rank| of_image(rank)).collect::<Result<_, _>>()?;
-        found.into_iter().for_each(|of_image| stars.add_image(of_image));
+        // Those found before are packed meanwhile, which only one thread can do.
+        let pack = || std::mem::take(&mut found).into_iter().for_each(|of_image| stars.add_image(of_image));
+        let ((), next) = rayon::join(pack, || of_images(some));
+        found = next?;
     }
+    found.into_iter().for_each(|of_image| stars.add_image(of_image));
     Ok(stars)
 }
 
 /// Images whose stars are found before they are packed, for each thread: enough for threads to be seldom without work.
-const IMAGES_PER_THREAD: usize = 4;
+const IMAGES_PER_THREAD: usize = 2;
 
 fn stars_of_image(
     model: &Reconstruction,
@@ -131,13 +136,15 @@ pub fn triangulate_star(
         Some(model.point(point)?.xyz)
     });
     let crossings = track[1..].iter().filter_map(|&seen| nearest_to_rays(query_ray, table.ray(seen)));
-    let cost_of =
-        |xyz: &Vector3<f64>| -> f64 { track.iter().map(|&seen| table.relative_error_sq(seen, xyz).min(1.0)).sum() };
-    let (xyz, _) = known
-        .chain(crossings)
-        .map(|xyz| (xyz, cost_of(&xyz)))
-        .filter(|(_, cost)| !cost.is_nan())
-        .min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let mut best: Option<(Vector3<f64>, f64)> = None;
+    for xyz in known.chain(crossings) {
+        // The cost only grows, so most are known to be no better before all sightings are looked at.
+        let least = best.map_or(f64::INFINITY, |(_, cost)| cost);
+        let mut costs = track.iter().map(|&seen| table.relative_error_sq(seen, &xyz).min(1.0));
+        let cost = costs.try_fold(0.0, |sum, cost| Some(sum + cost).filter(|sum| *sum < least));
+        best = cost.map(|cost| (xyz, cost)).or(best);
+    }
+    let (xyz, _) = best?;
     let inliers = |xyz: &Vector3<f64>| -> Vec<Sighting> {
         track.iter().copied().filter(|&seen| table.relative_error_sq(seen, xyz) <= 1.0).collect()
     };
