@@ -196,3 +196,52 @@ fn blur_along_body<const FMA: bool>(weights: &[f32], values: &[f32], out: &mut [
         out.copy_from_slice(&sum);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::Rng;
+
+    #[test]
+    fn kernels_have_the_variance_of_their_gaussian() {
+        for sigma in [0.6_f32, 0.92, 1.16, 1.46, 1.84, 2.31, 4.0] {
+            let spread = Kernel::gaussian(sigma).spread;
+            let middle = (spread.len() / 2) as f64;
+            let sum: f64 = spread.iter().map(|&weight| f64::from(weight)).sum();
+            let variance: f64 =
+                spread.iter().enumerate().map(|(k, &weight)| (k as f64 - middle).powi(2) * f64::from(weight)).sum();
+            assert!((sum - 1.0).abs() < 1e-6 && (variance.sqrt() - f64::from(sigma)).abs() < 1e-5, "{sigma}");
+        }
+    }
+
+    /// All rows of a picture, the last batch of which is not full, against the sums of the definition.
+    #[test]
+    fn rows_are_those_of_the_definition() {
+        let (width, height, kernel) = (53_usize, 22_usize, Kernel::gaussian(1.5));
+        let (radius, mut rng) = (kernel.radius(), Rng::from_parts(&[8]));
+        let mut source = Ring::new(width, height);
+        for _ in 0..height {
+            source.push()[..width].fill_with(|| rng.uniform() as f32);
+        }
+        let clamped = |at: usize, length: usize| at.saturating_sub(radius).min(length - 1);
+        let weighted = |of: &dyn Fn(usize) -> f64| -> f64 {
+            kernel.spread.iter().enumerate().map(|(k, &weight)| f64::from(weight) * of(k)).sum()
+        };
+        for isa in Isa::available() {
+            let mut scratch = Scratch::new(width, radius);
+            for y in (0..height).step_by(BATCH) {
+                let mut blurred = vec![vec![0.0_f32; padded(width)]; BATCH.min(height - y)];
+                let mut outs: Vec<&mut [f32]> = blurred.iter_mut().map(|row| &mut row[..]).collect();
+                blur_rows(isa, &kernel, &source, (width, height), y, &mut scratch, &mut outs);
+                for (row, blurred) in blurred.iter().enumerate() {
+                    for (x, &found) in blurred[..width].iter().enumerate() {
+                        let down =
+                            |column: usize| weighted(&|k| f64::from(source.row(clamped(y + row + k, height))[column]));
+                        let wanted = weighted(&|k| down(clamped(x + k, width)));
+                        assert!((f64::from(found) - wanted).abs() < 1e-5, "{isa:?} ({x}, {}): {found}", y + row);
+                    }
+                }
+            }
+        }
+    }
+}

@@ -12,11 +12,11 @@
 //! - Octave 0 starts from the original image, so the coarse octaves come first and the finest, which costs three times
 //!   the others together, only describes what still fits under the cap (`collector`, `forecast`).
 //!
-//! Where the time goes (2.5 megapixels, 26,624 features, one core with AVX-512): a third into blurs and differences, of
-//! which the blur along rows is limited by loads that straddle cache lines; a fifth into finding extrema and refining them;
-//! a seventh into orientations, limited by waiting for pixels and by roots and divisions; a seventh into descriptors, of
-//! which half is the arithmetic of sharing samples out (about a cycle a sample) and a third fetching them, and a thirtieth
-//! into the gradients they share.
+//! Where the time goes (2.5 megapixels, 26,624 features, one core with AVX2): a third into blurs and differences, of which the
+//! blur along rows is limited by loads that straddle cache lines; a fifth into finding extrema and refining them; a seventh
+//! into orientations, limited by waiting for pixels and by roots and divisions; a fifth into descriptors, of which half is
+//! the arithmetic of sharing samples out and half fetching them, and a twentieth into the gradients they share. With
+//! AVX-512 descriptors are a seventh, as sharing out is about a cycle a sample there.
 //!
 //! Everything is single precision and single-threaded; the kernels are stamped out for several instruction sets (`simd`)
 //! from one body, whose portable version is the oracle of the others.
