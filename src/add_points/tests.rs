@@ -1,5 +1,6 @@
 //! The stage on a scene with known truth.
 
+mod mutual;
 mod tracks;
 
 use std::collections::BTreeSet;
@@ -68,7 +69,7 @@ fn all_searches_give_the_same_matches() {
 
 /// Without the tolerance of line groups every query has its own band in all searches, and without random rivals nothing is
 /// left to chance. Two cameras side by side, and one behind the other with the epipole in the image, where features and poses
-/// do not fit together: what is compared are the candidates.
+/// do not fit together: what is compared are the candidates, both ways.
 #[test]
 fn the_sweep_finds_what_a_scan_of_all_features_finds() {
     let scene = build(&SceneSpec::default());
@@ -85,6 +86,7 @@ fn the_sweep_finds_what_a_scan_of_all_features_finds() {
                 pad_to: 0,
                 min_pair_matches: 0,
                 max_ratio: 1.0,
+                ratio_both_ways: true,
                 cheirality: false,
                 max_scale_discrepancy: None,
                 max_orientation_discrepancy_deg: None,
