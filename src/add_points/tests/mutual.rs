@@ -38,7 +38,7 @@ fn a_match_is_mutual_when_no_other_query_is_nearer_to_its_target() {
             options: &options.guided_match,
             check_ratio: false,
         };
-        let is_open = |query: u32| query % 3 != 0;
+        let is_open = |query: u32| !query.is_multiple_of(3);
         let found = search.run_mutual(is_open, Rng::from_parts(&[1]));
         let found: Vec<(u32, u32)> = found.into_iter().map(|found| (found.query, found.target)).collect();
 
