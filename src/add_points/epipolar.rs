@@ -170,7 +170,8 @@ impl EpipolarGeometry {
     }
 }
 
-fn finite(homogeneous: &Vector3<f64>) -> Option<Vector2<f64>> {
+/// The position of homogeneous coordinates; none when it is at infinity.
+pub(super) fn finite(homogeneous: &Vector3<f64>) -> Option<Vector2<f64>> {
     let at = homogeneous.xy() / homogeneous.z;
     at.iter().all(|c| c.is_finite()).then_some(at)
 }

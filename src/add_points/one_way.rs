@@ -10,7 +10,7 @@
 use nalgebra::Vector2;
 
 use super::candidate_search::{CandidateSearch, SeenMarks};
-use super::epipolar::{BoundingBox, EpipolarGeometry, EpipolarLine};
+use super::epipolar::{BoundingBox, EpipolarGeometry, EpipolarLine, finite};
 use super::line_groups::group_by_line;
 use super::options::GuidedMatchOptions;
 use super::pencil::Turn;
@@ -68,8 +68,7 @@ impl OneWay<'_> {
     pub fn run_mutual(&self, open: impl Fn(u32) -> bool, mut rng: Rng) -> Vec<Found> {
         let Some(bounds) = self.target.finder.bounds() else { return Vec::new() };
         let queries = self.query.finder.members().iter().copied();
-        let epipole = self.geometry.epipole_in_target();
-        let epipole = (epipole.z != 0.0).then(|| epipole.xy() / epipole.z);
+        let epipole = finite(&self.geometry.epipole_in_target());
         let is_mutual = |query: (usize, u32), target: (u32, u32), nearest: &NearestQueries| {
             nearest.of(target.0) == Some(query.0) && open(query.1) && self.is_clear(self.target, epipole, target.1)
         };

@@ -114,7 +114,7 @@ impl<'a> PairMatcher<'a> {
 }
 
 /// An image of the model, prepared for matching.
-fn prepare(
+pub(super) fn prepare(
     model: &Reconstruction,
     id: ImageId,
     features: Arc<Features>,

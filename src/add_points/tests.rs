@@ -67,16 +67,22 @@ fn all_searches_give_the_same_matches() {
     assert_eq!(with(CandidateSearch::Radial), oracle);
 }
 
+/// The posed model with image 3 moved behind image 2, so that the epipole is in the image.
+fn one_behind_the_other(scene: &TestScene) -> Reconstruction {
+    let mut model = scene.posed.clone();
+    let ahead = model.images()[&ImageId(2)].cam_from_world;
+    let behind = crate::geometry::Rigid3::new(ahead.rotation, ahead.translation + Vector3::new(0.02, 0.01, 0.6));
+    model.set_pose(ImageId(3), behind);
+    model
+}
+
 /// Without the tolerance of line groups every query has its own band in all searches, and without random rivals nothing is
 /// left to chance. Two cameras side by side, and one behind the other with the epipole in the image, where features and poses
 /// do not fit together: what is compared are the candidates, both ways.
 #[test]
 fn the_sweep_finds_what_a_scan_of_all_features_finds() {
     let scene = build(&SceneSpec::default());
-    let mut model = scene.posed.clone();
-    let ahead = model.images()[&ImageId(2)].cam_from_world;
-    let behind = crate::geometry::Rigid3::new(ahead.rotation, ahead.translation + Vector3::new(0.02, 0.01, 0.6));
-    model.set_pose(ImageId(3), behind);
+    let model = one_behind_the_other(&scene);
     for (posed, (a, b)) in [(&scene.posed, (0, 3)), (&scene.posed, (4, 1)), (&model, (2, 3)), (&model, (3, 2))] {
         let with = |search| {
             let mut options = AddPointsOptions::default();

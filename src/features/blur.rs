@@ -10,12 +10,10 @@ const CUTOFF_SIGMAS: f64 = 3.0;
 /// Steps of the widening, each of which leaves an error ten times smaller.
 const WIDENINGS: usize = 8;
 
-/// Half a symmetric, normalised Gaussian kernel.
+/// A symmetric, normalised Gaussian kernel.
 pub(super) struct Kernel {
-    /// The weight of the centre, then of its neighbours outwards.
-    weights: Vec<f32>,
     /// All weights from one end to the other.
-    spread: Vec<f32>,
+    weights: Vec<f32>,
 }
 
 /// Rows made together.
@@ -32,14 +30,17 @@ impl Kernel {
             |of: f64| 2.0 * (1..=radius).map(|k| (k * k) as f64 * weight_of(k, of)).sum::<f64>() / sum_of(of);
         let widened = (0..WIDENINGS).fold(sigma, |widened, _| widened * sigma / variance_of(widened).sqrt());
         let (weight, sum) = (|k: usize| weight_of(k, widened), sum_of(widened));
-        let weights: Vec<f32> = (0..=radius).map(|k| (weight(k) / sum) as f32).collect();
-        let spread = weights[1..].iter().rev().chain(&weights).copied().collect();
-        Self { weights, spread }
+        Self { weights: (0..=2 * radius).map(|k| (weight(k.abs_diff(radius)) / sum) as f32).collect() }
     }
 
     /// Pixels that it reaches to either side.
     pub(super) fn radius(&self) -> usize {
-        self.weights.len() - 1
+        self.weights.len() / 2
+    }
+
+    /// The weight of the centre, then of its neighbours outwards.
+    fn half(&self) -> &[f32] {
+        &self.weights[self.radius()..]
     }
 }
 
@@ -78,11 +79,11 @@ pub(super) fn blur_rows(
     let mut columns: [&mut [f32]; BATCH] = scratch.columns.each_mut().map(|columns| &mut columns[..stride]);
     {
         let targets = columns.each_mut().map(|columns| &mut columns[radius..radius + padded(width)]);
-        blur_columns(isa, &kernel.spread, &around, targets);
+        blur_columns(isa, &kernel.weights, &around, targets);
     }
     for (columns, out) in columns.iter_mut().zip(outs) {
         extend_border(columns, radius, width);
-        blur_along(isa, &kernel.weights, columns, out);
+        blur_along(isa, kernel.half(), columns, out);
     }
 }
 
@@ -205,11 +206,11 @@ mod tests {
     #[test]
     fn kernels_have_the_variance_of_their_gaussian() {
         for sigma in [0.6_f32, 0.92, 1.16, 1.46, 1.84, 2.31, 4.0] {
-            let spread = Kernel::gaussian(sigma).spread;
-            let middle = (spread.len() / 2) as f64;
-            let sum: f64 = spread.iter().map(|&weight| f64::from(weight)).sum();
+            let weights = Kernel::gaussian(sigma).weights;
+            let middle = (weights.len() / 2) as f64;
+            let sum: f64 = weights.iter().map(|&weight| f64::from(weight)).sum();
             let variance: f64 =
-                spread.iter().enumerate().map(|(k, &weight)| (k as f64 - middle).powi(2) * f64::from(weight)).sum();
+                weights.iter().enumerate().map(|(k, &weight)| (k as f64 - middle).powi(2) * f64::from(weight)).sum();
             assert!((sum - 1.0).abs() < 1e-6 && (variance.sqrt() - f64::from(sigma)).abs() < 1e-5, "{sigma}");
         }
     }
@@ -225,7 +226,7 @@ mod tests {
         }
         let clamped = |at: usize, length: usize| at.saturating_sub(radius).min(length - 1);
         let weighted = |of: &dyn Fn(usize) -> f64| -> f64 {
-            kernel.spread.iter().enumerate().map(|(k, &weight)| f64::from(weight) * of(k)).sum()
+            kernel.weights.iter().enumerate().map(|(k, &weight)| f64::from(weight) * of(k)).sum()
         };
         for isa in Isa::available() {
             let mut scratch = Scratch::new(width, radius);

@@ -291,10 +291,8 @@ impl Reconstruction {
 
     /// The reprojection error of every sighting of every point, image by image; images are shared out among threads.
     pub fn reprojection_errors_px(&self) -> Vec<f64> {
-        let of_image =
-            |&id: &ImageId| -> Vec<f64> { self.errors_of_image_px(id).map(|(_, error_px)| error_px).collect() };
-        let of_images: Vec<Vec<f64>> = self.images.par_iter().map(|(id, _)| of_image(id)).collect();
-        of_images.concat()
+        let of_image = |(&id, _)| self.errors_of_image_px(id).map(|(_, error_px)| error_px);
+        self.images.par_iter().flat_map_iter(of_image).collect()
     }
 
     fn error_px(&self, image: &RegisteredImage, camera: &Camera, id: Point3dId, keypoint: &Pixel) -> f64 {

@@ -1,20 +1,16 @@
 //! Which matches of a sweep are mutual, by their definition.
 
-use nalgebra::{Vector2, Vector3};
+use nalgebra::Vector2;
 
+use super::one_behind_the_other;
 use crate::add_points::epipolar::EpipolarGeometry;
 use crate::add_points::one_way::OneWay;
+use crate::add_points::pair_matcher::prepare;
 use crate::add_points::prepared::PreparedImage;
-use crate::add_points::test_scene::{SceneSpec, TestScene, build};
+use crate::add_points::test_scene::{SceneSpec, build};
 use crate::add_points::*;
 use crate::matching::descriptor::distance_sq;
 use crate::math::Rng;
-
-fn prepared(scene: &TestScene, model: &Reconstruction, image: u32, options: &AddPointsOptions) -> PreparedImage {
-    let (id, features) = (ImageId(image), scene.features[image as usize].clone());
-    let registered = &model.images()[&id];
-    PreparedImage::new(registered, model.camera_of(id), features, &options.guided_match, &options.pixel_scaling)
-}
 
 /// Two cameras side by side, and one behind the other with both epipoles in their images. Every third query is not asked, but
 /// competes.
@@ -22,12 +18,11 @@ fn prepared(scene: &TestScene, model: &Reconstruction, image: u32, options: &Add
 fn a_match_is_mutual_when_no_other_query_is_nearer_to_its_target() {
     let scene = build(&SceneSpec::default());
     let options = AddPointsOptions::default();
-    let mut model = scene.posed.clone();
-    let ahead = model.images()[&ImageId(2)].cam_from_world;
-    let behind = crate::geometry::Rigid3::new(ahead.rotation, ahead.translation + Vector3::new(0.02, 0.01, 0.6));
-    model.set_pose(ImageId(3), behind);
+    let model = one_behind_the_other(&scene);
+    let prepared =
+        |image: u32| prepare(&model, ImageId(image), scene.features[image as usize].clone(), &options).unwrap();
     for (a, b) in [(0, 5), (2, 3)] {
-        let (first, second) = (prepared(&scene, &model, a, &options), prepared(&scene, &model, b, &options));
+        let (first, second) = (prepared(a), prepared(b));
         let of = |image: &PreparedImage| (image.camera.clone(), image.cam_from_world);
         let ((camera_a, pose_a), (camera_b, pose_b)) = (of(&first), of(&second));
         let geometry = EpipolarGeometry::new((&camera_a, &pose_a), (&camera_b, &pose_b)).unwrap();
