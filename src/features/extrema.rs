@@ -20,7 +20,7 @@ use super::simd::stamp;
 pub(super) const MAX_ROW_STEPS: usize = 3;
 /// The fit moves on from a grid point whose extremum is farther than this in some coordinate; slightly more than half, so
 /// that an extremum midway between two seldom makes it swing.
-const MOVE_OFFSET: f32 = 0.6;
+pub(super) const MOVE_OFFSET: f32 = 0.6;
 /// Where it swings all the same, the last fit counts if its extremum is no farther than this.
 pub(super) const MAX_OFFSET: f32 = 1.0;
 /// Fits tried per extremum.

@@ -94,6 +94,11 @@ impl Forecast {
         faint.set_limit(share, self.wanted[Class::Faint as usize] - distinct.promised(share));
     }
 
+    /// Whether the limits have been above this scale, so that smaller ones are not counted on any more.
+    pub(super) fn has_passed(&self, scale: f32) -> bool {
+        self.classes.iter().all(|so_far| so_far.highest_limit >= scale)
+    }
+
     /// Everything of a class from this scale on was described.
     pub(super) fn complete_from(&self, class: Class) -> f32 {
         self.classes[class as usize].highest_limit

@@ -8,7 +8,8 @@ use super::simd::mul_add;
 /// Keeps the quotient of two vanishing gradients finite; far below any gradient of 8-bit pixels.
 const TINY: f32 = 1e-30;
 
-/// Pixels computed together; stretches are computed in whole multiples.
+/// Pixels computed together; stretches are computed in whole multiples. Eight compute fewer pixels beyond the ends, but
+/// whole extractions took a tenth longer with AVX2.
 pub(super) const LANES: usize = 16;
 /// Room for the longest stretch of one row that is looked at: across the orientation window of the largest sigma.
 const MAX_STRETCH: usize = 1024;

@@ -106,7 +106,8 @@ impl<'a> Octave<'a> {
     }
 
     /// Finds and describes the features of the octave, with a forecast only those that it wants, and returns the first level
-    /// of the next.
+    /// of the next. Levels that the forecast has passed are only blurred from there on: their extrema, which are the most, are
+    /// not even sought.
     pub(super) fn run(mut self, collector: &mut Collector<'_>, mut forecast: Option<&mut Forecast>) -> Plane {
         let (width, height) = (self.levels.width, self.levels.height);
         let per_octave = self.options.levels_per_octave;
@@ -118,17 +119,19 @@ impl<'a> Octave<'a> {
         let mut differences: Vec<Ring> = (0..per_octave + 2).map(|_| Ring::new(width, 3.min(height))).collect();
         let (mut candidates, mut extrema) = (Vec::new(), Vec::new());
         let mut worker = Worker { describer: Describer::new(), patch: Patch::new() };
+        // The first level whose extrema may still be wanted.
+        let mut finest = 1;
         for y in 0..height {
             for s in 0..self.levels.rings.len() {
                 self.ensure(s, y + self.lead[s]);
             }
-            for (map, level) in self.gradients.iter_mut().zip(&self.levels.rings[1..]) {
+            for (map, level) in self.gradients.iter_mut().zip(&self.levels.rings[1..]).skip(finest - 1) {
                 map.follow(self.isa, level);
             }
             if wants_next && y.is_multiple_of(2) {
                 next.data.extend(self.levels.rings[per_octave].row(y)[..width].iter().step_by(2));
             }
-            for (s, ring) in differences.iter_mut().enumerate() {
+            for (s, ring) in differences.iter_mut().enumerate().skip(finest - 1) {
                 extrema::subtract(self.isa, self.levels.rings[s + 1].row(y), self.levels.rings[s].row(y), ring.push());
             }
             // Row y completes the neighbourhood of the row above it.
@@ -139,7 +142,7 @@ impl<'a> Octave<'a> {
             let takes_faint =
                 collector.has_room_for_faint() && forecast.as_ref().is_none_or(|told| told.has_room_for_faint());
             let least = if takes_faint { self.options.faint_threshold } else { self.options.peak_threshold };
-            for s in 1..=per_octave {
+            for s in finest..=per_octave {
                 candidates.clear();
                 extrema::scan_row(self.isa, &differences[s - 1..=s + 1], y - 1, width, least, &mut candidates);
                 let fits =
@@ -157,6 +160,9 @@ impl<'a> Octave<'a> {
             }
             if let Some(forecast) = &mut forecast {
                 forecast.finish_row(y, self.step_px());
+                while finest <= per_octave && forecast.has_passed(self.max_scale_of_level_px(finest)) {
+                    finest += 1;
+                }
             }
             for extremum in &extrema {
                 self.describe(extremum, &mut worker, collector);
@@ -200,6 +206,12 @@ impl<'a> Octave<'a> {
     /// Original pixels to a pixel of the octave.
     fn step_px(&self) -> f32 {
         2.0_f32.powi(self.index)
+    }
+
+    /// The largest scale, in original pixels, of an extremum found on the grid of level `s`, but for the few that the fit
+    /// takes to another level.
+    fn max_scale_of_level_px(&self, s: usize) -> f32 {
+        level_sigma(self.options, s as f32 + extrema::MOVE_OFFSET) * self.step_px()
     }
 
     /// The scale of an extremum in original pixels.
