@@ -202,11 +202,12 @@ fn extremum_lanes(
     Some(hits)
 }
 
-/// Fits the grid extremum in column `x`, row `y` of difference `s`; none when the fit wanders off, the contrast is below
-/// `least` or the curvatures are those of an edge.
+/// Fits the grid extremum in column `x`, row `y` of difference `s`; none when the fit wanders off, or to a level before
+/// `finest`, the contrast is below `least` or the curvatures are those of an edge.
 pub(super) fn fit(
     levels: &Levels,
     (mut x, mut y, mut s): (usize, usize, usize),
+    finest: usize,
     least: f32,
     options: &SiftOptions,
 ) -> Option<Fit> {
@@ -238,7 +239,7 @@ pub(super) fn fit(
         }
         x = step(x, offset.x, 1, levels.width - 2)?;
         y = step(y, offset.y, 1, levels.height - 2)?;
-        s = step(s, offset.z, 1, options.levels_per_octave)?;
+        s = step(s, offset.z, finest, options.levels_per_octave)?;
         if y.abs_diff(first_y) > MAX_ROW_STEPS {
             return None;
         }

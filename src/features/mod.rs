@@ -11,7 +11,7 @@
 //! - Descriptors are not made of pixels but of gradients that neighbouring keypoints share (`gradient_map`).
 //! - Octave 0 starts from the original image, so the coarse octaves come first and the finest, which costs three times
 //!   the others together, only describes what still fits under the cap (`collector`, `forecast`). Its levels that are all
-//!   below what fits are not even searched: a twelfth of the time of pictures of 2.5 to 4 megapixels.
+//!   below what fits are not even searched: a twelfth of the time of pictures of 2.5 megapixels.
 //!
 //! Where the time goes (2.5 megapixels, 26,624 features, one core with AVX2): a third into blurs and differences, of which the
 //! blur along rows is limited by loads that straddle cache lines; a fifth into finding extrema and refining them; a seventh

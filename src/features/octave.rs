@@ -145,8 +145,9 @@ impl<'a> Octave<'a> {
             for s in finest..=per_octave {
                 candidates.clear();
                 extrema::scan_row(self.isa, &differences[s - 1..=s + 1], y - 1, width, least, &mut candidates);
+                let (levels, options) = (&self.levels, self.options);
                 let fits =
-                    candidates.iter().filter_map(|&x| extrema::fit(&self.levels, (x, y - 1, s), least, self.options));
+                    candidates.iter().filter_map(|&x| extrema::fit(levels, (x, y - 1, s), finest, least, options));
                 let wanted = fits.filter(|fit| {
                     let extremum = fit.extremum();
                     let (scale, (x, y)) = (self.scale_px(&extremum), self.place_px(&extremum));
@@ -209,7 +210,7 @@ impl<'a> Octave<'a> {
     }
 
     /// The largest scale, in original pixels, of an extremum found on the grid of level `s`, but for the few that the fit
-    /// takes to another level.
+    /// takes to a coarser level.
     fn max_scale_of_level_px(&self, s: usize) -> f32 {
         level_sigma(self.options, s as f32 + extrema::MOVE_OFFSET) * self.step_px()
     }
