@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use super::grouped::Grouped;
 use super::stars::StarTracks;
 use super::views::ViewTable;
 use crate::math::UnionFind;
@@ -45,36 +46,11 @@ impl Components {
 
     /// How many.
     pub fn len(&self) -> usize {
-        self.stars.starts.len() - 1
+        self.stars.len()
     }
 
     /// The numbers of a component's tracks and the ids of its points, both ascending.
     pub fn get(&self, component: usize) -> (&[u32], &[Point3dId]) {
         (self.stars.group(component), self.points.group(component))
-    }
-}
-
-/// Items by their groups, one after the other.
-struct Grouped<T> {
-    /// Group g is `items[starts[g]..starts[g + 1]]`.
-    starts: Vec<u32>,
-    items: Vec<T>,
-}
-
-impl<T: Ord> Grouped<T> {
-    fn new(count: usize, mut grouped: Vec<(u32, T)>) -> Self {
-        grouped.sort_unstable();
-        let mut starts = vec![0; count + 1];
-        for (group, _) in &grouped {
-            starts[*group as usize + 1] += 1;
-        }
-        for at in 0..count {
-            starts[at + 1] += starts[at];
-        }
-        Self { starts, items: grouped.into_iter().map(|(_, item)| item).collect() }
-    }
-
-    fn group(&self, group: usize) -> &[T] {
-        &self.items[self.starts[group] as usize..self.starts[group + 1] as usize]
     }
 }

@@ -32,6 +32,8 @@ pub struct TrackUpdate {
     pub xyz: Vector3<f64>,
     /// All sightings, sorted, one an image.
     pub track: Vec<Observation>,
+    /// A new point of two sightings whose match is not distinctive: no point unless a third image sees it.
+    pub tentative: bool,
 }
 
 /// Merges tracks with one another and with the model's points. The order of the result is fixed.
@@ -122,8 +124,18 @@ impl<'a> Resolver<'a> {
         for at in 0..self.points.len() {
             updates.extend(self.extend_point(self.points[at]));
         }
+        let mut tentative = Vec::new();
         for at in 0..self.stars.len() {
-            updates.extend(self.make_point(self.stars[at]));
+            match self.find_point(self.stars[at]) {
+                Some(update) if update.tentative => tentative.push(update),
+                found => updates.extend(found.map(|update| self.settle(update))),
+            }
+        }
+        // What nothing else confirms may have the sightings that are left.
+        for update in tentative {
+            if !update.track.iter().any(|seen| self.is_taken(self.table.sighting(seen))) {
+                updates.push(self.settle(update));
+            }
         }
         updates
     }
@@ -172,19 +184,23 @@ impl<'a> Resolver<'a> {
         Some(self.update(Some(id), absorbs, xyz, &track))
     }
 
-    /// Makes a point of the free sightings that agree with a track's position.
-    fn make_point(&mut self, star: Star<'_>) -> Option<TrackUpdate> {
+    /// The point of the free sightings that agree with a track's position.
+    fn find_point(&self, star: Star<'_>) -> Option<TrackUpdate> {
         let free = |seen: &&Sighting| self.claim(**seen).is_some_and(|claim| !claim.taken && claim.owner.is_none());
         if star.sightings.iter().filter(free).count() < 2 {
             return None;
         }
         let grant = |xyz: &Vector3<f64>| self.best_per_image(xyz, None, |claim| claim.owner.is_none());
         let (xyz, track) = refit(self.table, star.xyz, grant)?;
-        if !self.is_good(&xyz, &track, star.distinctive) {
-            return None;
-        }
-        self.take(&track);
-        Some(self.update(None, Vec::new(), xyz, &track))
+        let tentative = track.len() == 2 && !star.distinctive;
+        self.is_good(&xyz, &track).then(|| TrackUpdate { tentative, ..self.update(None, Vec::new(), xyz, &track) })
+    }
+
+    /// Takes the sightings of a new point.
+    fn settle(&mut self, update: TrackUpdate) -> TrackUpdate {
+        let sightings: Vec<Sighting> = update.track.iter().map(|seen| self.table.sighting(seen)).collect();
+        self.take(&sightings);
+        update
     }
 
     /// The free sightings that agree with a position, of each image the one with the smallest error, sorted. Where images are
@@ -234,11 +250,11 @@ impl<'a> Resolver<'a> {
     }
 
     /// Whether a track fixes a new point well enough.
-    fn is_good(&self, xyz: &Vector3<f64>, track: &[Sighting], distinctive: bool) -> bool {
+    fn is_good(&self, xyz: &Vector3<f64>, track: &[Sighting]) -> bool {
         let two_views = track.len() == 2;
         let min_angle_deg = if two_views { self.options.min_angle_two_view_deg } else { self.options.min_angle_deg };
         track.len() >= self.options.min_track_length
-            && (!two_views || distinctive && track.iter().all(|&seen| self.table.fits_two_view(seen, xyz)))
+            && (!two_views || track.iter().all(|&seen| self.table.fits_two_view(seen, xyz)))
             && self.table.has_angle(track, xyz, min_angle_deg.to_radians())
     }
 
@@ -250,7 +266,7 @@ impl<'a> Resolver<'a> {
         track: &[Sighting],
     ) -> TrackUpdate {
         let track = track.iter().map(|&seen| self.table.observation(seen)).collect();
-        TrackUpdate { extends, absorbs, xyz, track }
+        TrackUpdate { extends, absorbs, xyz, track, tentative: false }
     }
 
     fn claim(&self, seen: Sighting) -> Option<&Claim> {

@@ -10,7 +10,8 @@
 //! - [`guided_match`](mod@guided_match) (6.2.2, 6.2.3): best descriptor along the line, ratio test after the geometry;
 //! - [`triangulate`] (6.3): each image's matches as tracks, and their points, kept in little room ([`stars`]);
 //! - [`merge`] (6.3): the pieces of one point made one;
-//! - [`strays`]: points that rest on one match and lie where nothing else is, taken out at the end.
+//! - [`strays`]: points that rest on one match and lie where nothing else is, taken out at the end;
+//! - [`completion`]: a third sighting for points of two, where they project to, at the end.
 //!
 //! A pair is a unit of work ([`PairMatcher`]): a pure function of the model, both images' features, options and seed. Poses
 //! are not changed; every pair and every image is independent of the others, and results are put together in id order, so
@@ -18,9 +19,11 @@
 
 pub mod candidate_pairs;
 pub mod candidate_search;
+pub mod completion;
 mod components;
 pub mod epipolar;
 pub mod grid;
+mod grouped;
 pub mod guided_match;
 pub mod line_groups;
 pub mod merge;
@@ -45,6 +48,7 @@ use serde::{Deserialize, Serialize};
 
 pub use candidate_pairs::{CandidatePair, candidate_pairs};
 pub use candidate_search::CandidateSearch;
+pub use completion::{Completer, CompletionOptions};
 pub use guided_match::{KeypointMatch, guided_match};
 pub use options::{
     AddPointsOptions, BlockOptions, CandidatePairOptions, GuidedMatchOptions, PixelScaling, TriangulationOptions,
@@ -54,7 +58,7 @@ pub use prepared::PreparedImage;
 pub use strays::{StrayOptions, remove_strays};
 pub use triangulate::PairMatches;
 
-use crate::scene::{Features, ImageId, Reconstruction};
+use crate::scene::{Features, ImageId, Observation, Reconstruction};
 
 /// Why the stage ended without a result.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -111,8 +115,11 @@ pub type LoadFeatures<'a> = dyn Fn(ImageId) -> Arc<Features> + Sync + 'a;
 /// Whether somebody asked to stop.
 pub type Cancelled<'a> = dyn Fn() -> bool + Sync + 'a;
 
+/// Two sightings of what may be one point.
+pub type PairOfSightings = [Observation; 2];
+
 /// Brings the matches of all pairs into the model: tracks per image, triangulation, merging (6.3). The order of the pairs does
-/// not show.
+/// not show. Also returns the matches that nothing but themselves speaks for and that are not distinctive.
 ///
 /// # Errors
 /// When cancelled; the model is then unchanged.
@@ -121,7 +128,7 @@ pub fn add_matches(
     mut matches: Vec<PairMatches>,
     options: &AddPointsOptions,
     cancelled: &Cancelled,
-) -> Result<AddPointsReport, AddPointsError> {
+) -> Result<(AddPointsReport, Vec<PairOfSightings>), AddPointsError> {
     matches.sort_by_key(|pair| (pair.first, pair.second));
     let mut report = AddPointsReport {
         pairs_tried: matches.len(),
@@ -138,6 +145,7 @@ pub fn add_matches(
         drop(matches);
         merge::merge_tracks(model, &table, &stars, &options.triangulation, cancelled)?
     };
+    let (tentative, updates): (Vec<_>, Vec<_>) = updates.into_iter().partition(|update| update.tentative);
     let counts = merge::apply_updates(model, updates);
     report.points_created = counts.created;
     report.points_extended = counts.extended;
@@ -145,5 +153,6 @@ pub fn add_matches(
     report.points_after = model.num_points();
     report.points_3plus_after = model.num_points_3plus();
     report.observations_after = model.num_observations();
-    Ok(report)
+    let unconfirmed = tentative.into_iter().map(|update| [update.track[0], update.track[1]]).collect();
+    Ok((report, unconfirmed))
 }

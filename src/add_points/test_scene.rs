@@ -208,5 +208,5 @@ pub fn add_points(
         matcher.prepare(&tile, cancelled)?;
         matches.extend(matcher.match_pairs(&tile, &one_more, cancelled)?);
     }
-    add_matches(model, matches, options, cancelled)
+    Ok(add_matches(model, matches, options, cancelled)?.0)
 }

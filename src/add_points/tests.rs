@@ -1,5 +1,6 @@
 //! The stage on a scene with known truth.
 
+mod completion;
 mod mutual;
 mod tracks;
 

@@ -192,6 +192,11 @@ pub fn refit(
     Some((xyz, granted))
 }
 
+/// The point half-way between the rays of two sightings where they are nearest; none where that is not in front of both images.
+pub fn crossing(table: &ViewTable, [a, b]: [Sighting; 2]) -> Option<Vector3<f64>> {
+    nearest_to_rays(table.ray(a), table.ray(b))
+}
+
 /// Rays at a smaller sine of their angle than this have no crossing to speak of (1e-6 rad is a thousandth of a pixel).
 const MIN_SINE_SQ: f64 = 1e-12;
 

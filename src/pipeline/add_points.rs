@@ -11,8 +11,8 @@ use super::runner::{Counts, StageProgress, counts};
 use super::units::Units;
 use super::{Context, PipelineError, Stage};
 use crate::add_points::{
-    AddPointsError, AddPointsOptions, AddPointsReport, CandidatePair, PairMatcher, PairMatches, add_matches,
-    candidate_pairs, tiles,
+    AddPointsError, AddPointsOptions, AddPointsReport, CandidatePair, PairMatcher, PairMatches, PairOfSightings,
+    add_matches, candidate_pairs, tiles,
 };
 use crate::scene::{Features, ImageId, Reconstruction};
 
@@ -33,7 +33,8 @@ pub struct PointAdder<'a> {
 }
 
 impl PointAdder<'_> {
-    /// Adds points to the model of this rank; with `new_images`, only pairs with one of them are matched.
+    /// Adds points to the model of this rank; with `new_images`, only pairs with one of them are matched. Returns matches that
+    /// may still become points, too ([`add_matches`]).
     ///
     /// # Errors
     /// Cancellation, features that were lost, or units that can't be stored.
@@ -43,12 +44,12 @@ impl PointAdder<'_> {
         model: &mut Reconstruction,
         new_images: Option<&BTreeSet<ImageId>>,
         progress: &StageProgress<'_>,
-    ) -> Result<Counts, PipelineError> {
+    ) -> Result<(Counts, Vec<PairOfSightings>), PipelineError> {
         let pairs = candidate_pairs(model, new_images, &self.options.candidate_pairs);
         let (matches, reused) = self.match_pairs(rank, model, &pairs, progress)?;
         let cancelled = || self.context.cancel.is_cancelled();
-        let report = self.expect(add_matches(model, matches, self.options, &cancelled))?;
-        Ok(totals(&report, reused))
+        let (report, unconfirmed) = self.expect(add_matches(model, matches, self.options, &cancelled))?;
+        Ok((totals(&report, reused), unconfirmed))
     }
 
     /// The matches of all pairs, and how many of these an earlier run had matched.

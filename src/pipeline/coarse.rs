@@ -161,11 +161,7 @@ pub fn run(
     notes.extend(background_note(&before));
     notes.extend(look_alike_note(&account, intake));
     let mut state = PipelineState {
-        models: models
-            .models
-            .into_iter()
-            .map(|model| ModelState { model, registered_in: BTreeMap::new(), history: Vec::new() })
-            .collect(),
+        models: models.models.into_iter().map(ModelState::new).collect(),
         unregistered: models.unregistered,
         most_alike: most_alike(&before.graph),
     };

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::PipelineError;
 use super::focals::FocalOptions;
 use crate::add_cameras::AddCamerasOptions;
-use crate::add_points::{AddPointsOptions, StrayOptions};
+use crate::add_points::{AddPointsOptions, CompletionOptions, StrayOptions};
 use crate::bundle::BundleOptions;
 use crate::camera::{CameraModel, TYPICAL_FOCAL};
 use crate::coarse::MapperOptions;
@@ -162,6 +162,8 @@ pub struct RefineOptions {
     pub min_triangulation_angle_deg: f64,
     /// Which points of two sightings are taken for wrong matches.
     pub strays: StrayOptions,
+    /// How points of two sightings are looked for in further images once poses are final; none leaves that out.
+    pub completion: Option<CompletionOptions>,
     /// The adjustment. Robust by default: guided matches hold a few wrong ones within the limits. Measured against
     /// least squares: temple ring AUC@1 80 for 78, the surveyed fountain unchanged. Reweighting nears its end in many
     /// small steps: at a tolerance of 1e-3 it takes a quarter of the time of 1e-6 and the poses are as good.
@@ -175,6 +177,7 @@ impl Default for RefineOptions {
             rounds: 2,
             min_triangulation_angle_deg: 2.0,
             strays: StrayOptions::default(),
+            completion: Some(CompletionOptions::default()),
             bundle: BundleOptions {
                 loss: RobustLoss::Cauchy { scale: 1.0 },
                 function_tolerance: 1e-3,
@@ -215,6 +218,9 @@ impl ReconstructionOptions {
         self.add_points.validate(&mut errors);
         self.refine.bundle.validate(&mut errors);
         self.refine.strays.validate(&mut errors);
+        if let Some(completion) = &self.refine.completion {
+            completion.validate(&mut errors);
+        }
         let mut check = |holds: bool, message: &str| {
             if !holds {
                 errors.push(message.to_owned());

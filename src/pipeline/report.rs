@@ -136,7 +136,7 @@ mod tests {
                 let camera = Camera::centered(CameraModel::SimpleRadial, 1000, 800, focal_px, source);
                 let mut model = Reconstruction::new([(CameraId(0), camera.clone()), (CameraId(1), camera)].into());
                 model.register(ImageId(0), CameraId(0), Rigid3::identity(), [].into());
-                let states = [ModelState { model, registered_in: BTreeMap::new(), history: Vec::new() }];
+                let states = [ModelState::new(model)];
                 let notes = focal_notes(&states, &FocalVotingOptions::default());
                 assert_eq!(notes.len(), usize::from(noted && far), "{source:?} {focal_px}: {notes:?}");
             }

@@ -124,11 +124,13 @@ impl Pipeline<'_> {
                 let adder = PointAdder { features: &features, units: &units, options: &options.add_points, context };
                 let mut state = before;
                 let mut totals = Counts::new();
-                for (rank, ModelState { model, .. }) in state.models.iter_mut().enumerate() {
+                for (rank, ModelState { model, unconfirmed, .. }) in state.models.iter_mut().enumerate() {
                     let here = |id: &ImageId| model.image(*id).is_some();
                     let newly: Option<BTreeSet<ImageId>> =
                         newly.as_ref().map(|newly| newly.iter().copied().filter(here).collect());
-                    for (name, count) in adder.run(rank, model, newly.as_ref(), progress)? {
+                    let (counts, more) = adder.run(rank, model, newly.as_ref(), progress)?;
+                    unconfirmed.extend(more);
+                    for (name, count) in counts {
                         *totals.entry(name).or_insert(0.0) += count;
                     }
                 }
@@ -141,18 +143,26 @@ impl Pipeline<'_> {
         if options.refine.enabled {
             models_key = ArtifactKey::of("refine", &[&models_key.0, &options.refine]);
             let before = state;
-            state =
-                runner.stage(key(Stage::Refine), Some(&models_key), before.models.len() as u64, |_, progress| {
+            state = runner.stage(
+                key(Stage::Refine),
+                Some(&models_key),
+                before.models.len() as u64,
+                |store, progress| {
+                    let features = StoredFeatures::new(store, &found);
                     let mut state = before;
                     let points_before: usize = state.models.iter().map(|account| account.model.num_points()).sum();
+                    let mut completed = 0;
                     for account in &mut state.models {
-                        refine::refine(&mut account.model, options, context)?;
+                        completed += refine::refine(account, &features, options, context)?;
                         progress.tick();
                     }
                     let points: usize = state.models.iter().map(|account| account.model.num_points()).sum();
                     state.record(key(Stage::Refine));
-                    Ok((state, counts([("points_before", points_before), ("points", points)])))
-                })?;
+                    let totals =
+                        [("points_before", points_before), ("points_completed", completed), ("points", points)];
+                    Ok((state, counts(totals)))
+                },
+            )?;
         }
 
         self.finish(runner, watch, &intake, &found, state, (notes, &cut))

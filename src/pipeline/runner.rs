@@ -21,7 +21,7 @@ use crate::store::ArtifactStore;
 pub type Counts = BTreeMap<String, f64>;
 
 /// Changes whenever stored stage results of an earlier build must not be re-used.
-const FORMAT_VERSION: u32 = 9;
+const FORMAT_VERSION: u32 = 10;
 
 /// The key a stage's result is stored under.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::StageKey;
+use crate::add_points::PairOfSightings;
 use crate::coarse::Unregistered;
 use crate::formats::report::ModelStage;
 use crate::scene::{ImageId, Reconstruction};
@@ -14,10 +15,19 @@ use crate::scene::{ImageId, Reconstruction};
 pub struct ModelState {
     /// The model.
     pub model: Reconstruction,
+    /// Matches that become points if a third image sees the same.
+    pub unconfirmed: Vec<PairOfSightings>,
     /// The stage that registered each image.
     pub registered_in: BTreeMap<ImageId, String>,
     /// The model after each stage that changed it.
     pub history: Vec<ModelStage>,
+}
+
+impl ModelState {
+    /// A model without history.
+    pub fn new(model: Reconstruction) -> Self {
+        Self { model, unconfirmed: Vec::new(), registered_in: BTreeMap::new(), history: Vec::new() }
+    }
 }
 
 /// All models, and why every other image is in none.
@@ -44,7 +54,7 @@ impl PipelineState {
             for &id in account.model.images().keys() {
                 account.registered_in.entry(id).or_insert_with(|| stage.to_string());
             }
-            let ModelState { model, registered_in, history } = account;
+            let ModelState { model, registered_in, history, .. } = account;
             registered_in.retain(|id, _| model.image(*id).is_some());
             history.push(summary(stage, model));
         }
