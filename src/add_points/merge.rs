@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use super::components::Components;
 use super::options::TriangulationOptions;
 use super::stars::{Star, StarTracks};
-use super::triangulate::refit;
+use super::triangulate::{fixes_point, refit};
 use super::views::{Sighting, ViewTable};
 use super::{AddPointsError, Cancelled};
 use crate::scene::{ImageId, Observation, Point3dId, Reconstruction};
@@ -193,7 +193,8 @@ impl<'a> Resolver<'a> {
         let grant = |xyz: &Vector3<f64>| self.best_per_image(xyz, None, |claim| claim.owner.is_none());
         let (xyz, track) = refit(self.table, star.xyz, grant)?;
         let tentative = track.len() == 2 && !star.distinctive;
-        self.is_good(&xyz, &track).then(|| TrackUpdate { tentative, ..self.update(None, Vec::new(), xyz, &track) })
+        fixes_point(self.table, &xyz, &track, self.options)
+            .then(|| TrackUpdate { tentative, ..self.update(None, Vec::new(), xyz, &track) })
     }
 
     /// Takes the sightings of a new point.
@@ -247,15 +248,6 @@ impl<'a> Resolver<'a> {
         });
         sightings.sort_by_key(|&(seen, _)| seen);
         sightings
-    }
-
-    /// Whether a track fixes a new point well enough.
-    fn is_good(&self, xyz: &Vector3<f64>, track: &[Sighting]) -> bool {
-        let two_views = track.len() == 2;
-        let min_angle_deg = if two_views { self.options.min_angle_two_view_deg } else { self.options.min_angle_deg };
-        track.len() >= self.options.min_track_length
-            && (!two_views || track.iter().all(|&seen| self.table.fits_two_view(seen, xyz)))
-            && self.table.has_angle(track, xyz, min_angle_deg.to_radians())
     }
 
     fn update(

@@ -10,7 +10,7 @@ use super::options::{AddPointsOptions, BlockOptions};
 use super::prepared::PreparedImage;
 use super::triangulate::PairMatches;
 use super::{AddPointsError, Cancelled, CandidatePair, LoadFeatures};
-use crate::scene::{Features, ImageId, KeypointIdx, Reconstruction};
+use crate::scene::{Features, ImageId, KeypointIdx, Reconstruction, RegisteredImage};
 
 /// The pairs in tiles of so many images by as many, each tile in one piece, so that images are prepared once a tile and memory
 /// does not grow with their number. A side is never shorter than there are threads, or some would often be without work.
@@ -120,12 +120,22 @@ pub(super) fn prepare(
     features: Arc<Features>,
     options: &AddPointsOptions,
 ) -> Result<PreparedImage, AddPointsError> {
+    let image = image_of_features(model, id, &features)?;
+    Ok(PreparedImage::new(image, model.camera_of(id), features, &options.guided_match, &options.pixel_scaling))
+}
+
+/// The registered image that features are of.
+pub(super) fn image_of_features<'a>(
+    model: &'a Reconstruction,
+    id: ImageId,
+    features: &Features,
+) -> Result<&'a RegisteredImage, AddPointsError> {
     let image = model.image(id).ok_or(AddPointsError::NotRegistered(id))?;
     let (features_len, keypoints) = (features.len(), image.keypoints.len());
     if features_len != keypoints || features.descriptors.len() != keypoints {
         return Err(AddPointsError::FeaturesDoNotFit { image: id, features: features_len, keypoints });
     }
-    Ok(PreparedImage::new(image, model.camera_of(id), features, &options.guided_match, &options.pixel_scaling))
+    Ok(image)
 }
 
 fn match_prepared(

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::guided_match::KeypointMatch;
+use super::options::TriangulationOptions;
 use super::stars::StarTracks;
 use super::views::{Sighting, ViewTable};
 use super::{AddPointsError, Cancelled};
@@ -145,10 +146,7 @@ pub fn triangulate_star(
         best = cost.map(|cost| (xyz, cost)).or(best);
     }
     let (xyz, _) = best?;
-    let inliers = |xyz: &Vector3<f64>| -> Vec<Sighting> {
-        track.iter().copied().filter(|&seen| table.relative_error_sq(seen, xyz) <= 1.0).collect()
-    };
-    let (xyz, mut sightings) = refit(table, xyz, inliers)?;
+    let (xyz, mut sightings) = refit(table, xyz, |xyz| table.agreeing(&track, xyz))?;
     if sightings[0] != query {
         return None;
     }
@@ -190,6 +188,15 @@ pub fn refit(
         }
     }
     Some((xyz, granted))
+}
+
+/// Whether a track fixes a new point well enough.
+pub fn fixes_point(table: &ViewTable, xyz: &Vector3<f64>, track: &[Sighting], options: &TriangulationOptions) -> bool {
+    let two_views = track.len() == 2;
+    let min_angle_deg = if two_views { options.min_angle_two_view_deg } else { options.min_angle_deg };
+    track.len() >= options.min_track_length
+        && (!two_views || track.iter().all(|&seen| table.fits_two_view(seen, xyz)))
+        && table.has_angle(track, xyz, min_angle_deg.to_radians())
 }
 
 /// The point half-way between the rays of two sightings where they are nearest; none where that is not in front of both images.

@@ -107,6 +107,11 @@ impl<'a> ViewTable<'a> {
         self.error_sq_px(seen, xyz) / (view.max_error_px * view.max_error_px)
     }
 
+    /// The sightings, of these, whose reprojection errors are allowed.
+    pub fn agreeing(&self, track: &[Sighting], xyz: &Vector3<f64>) -> Vec<Sighting> {
+        track.iter().copied().filter(|&seen| self.relative_error_sq(seen, xyz) <= 1.0).collect()
+    }
+
     /// Whether a point's reprojection error is small enough for a point with two sightings.
     pub fn fits_two_view(&self, seen: Sighting, xyz: &Vector3<f64>) -> bool {
         self.error_sq_px(seen, xyz).sqrt() <= self.views[seen.rank as usize].max_two_view_error_px
