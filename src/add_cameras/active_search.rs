@@ -11,8 +11,11 @@
 //! Each has its ratio test, stricter for 3D to 2D, where the competitors are few. The search ends when the correspondences
 //! are enough.
 //!
-//! Departures: features of one word are searched together, since they cost the same and share the packed list; distances
-//! are exact; a point is listed under the words of all its sightings, with its mean descriptor.
+//! Departures: features of one word are searched together, since they cost the same; distances are exact; a point is listed
+//! under the words of all its sightings, with its mean descriptor.
+//!
+//! Points by word and features by coarser word are laid out for the kernels once a model and once an image: laying out the
+//! candidates of every point anew took twenty times as long as comparing them with it.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -24,8 +27,8 @@ use super::correspondences::{Correspondence, OneToOne};
 use super::vocabulary::Word;
 use super::{ActiveSearchOptions, ModelSnapshot};
 use crate::matching::RatioTest;
-use crate::matching::descriptor::{PackedDescriptors, Top2, top2};
-use crate::scene::{Descriptor, Features, KeypointIdx};
+use crate::matching::descriptor::{CellLists, CellRows};
+use crate::scene::{Features, KeypointIdx};
 
 /// A place in the queue: ties in cost go to the 2D-to-3D direction, then to the lower number.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -41,13 +44,12 @@ struct Search<'a> {
     snapshot: &'a ModelSnapshot,
     features: &'a Features,
     options: &'a ActiveSearchOptions,
-    features_of_word: Vec<Vec<u32>>,
-    features_of_coarse_word: Vec<Vec<u32>>,
+    features_of_word: CellLists,
+    features_of_coarse_word: CellLists,
+    rows_of_coarse_word: CellRows,
     queue: BinaryHeap<Reverse<(usize, Task)>>,
     queued_points: Vec<bool>,
     found: OneToOne,
-    packed: PackedDescriptors,
-    nearest: Vec<Top2>,
 }
 
 /// The correspondences of an image's features with the model.
@@ -57,29 +59,28 @@ pub fn active_search(
     options: &ActiveSearchOptions,
 ) -> Vec<Correspondence> {
     let vocabulary = &snapshot.vocabulary;
-    let mut features_of_word = vec![Vec::new(); vocabulary.num_words()];
-    let mut features_of_coarse_word = vec![Vec::new(); vocabulary.num_coarse_words()];
-    for (feature, word) in (0u32..).zip(vocabulary.words_of(&features.descriptors)) {
-        features_of_word[word as usize].push(feature);
-        features_of_coarse_word[vocabulary.coarse_word_of(word) as usize].push(feature);
-    }
+    let words = vocabulary.words_of(&features.descriptors);
+    let seen = || words.iter().copied().zip(0u32..);
+    let features_of_word = CellLists::new(vocabulary.num_words(), seen());
+    let coarse = seen().map(|(word, feature)| (vocabulary.coarse_word_of(word), feature));
+    let features_of_coarse_word = CellLists::new(vocabulary.num_coarse_words(), coarse);
     let mut queue = BinaryHeap::new();
-    for (word, (seen, listed)) in (0..).zip(features_of_word.iter().zip(&snapshot.points_of_word)) {
-        if !seen.is_empty() && !listed.is_empty() {
-            queue.push(Reverse((listed.len(), Task::FeaturesOfWord(word))));
+    for word in 0..vocabulary.num_words() as Word {
+        let listed = snapshot.points_of_word.of(word).len();
+        if !features_of_word.of(word).is_empty() && listed > 0 {
+            queue.push(Reverse((listed, Task::FeaturesOfWord(word))));
         }
     }
     let mut search = Search {
         snapshot,
         features,
         options,
+        rows_of_coarse_word: CellRows::pack(&features.descriptors, &features_of_coarse_word),
         features_of_word,
         features_of_coarse_word,
         queue,
         queued_points: vec![false; snapshot.len()],
         found: OneToOne::default(),
-        packed: PackedDescriptors::new(),
-        nearest: Vec::new(),
     };
     let (to_3d, to_2d) = (
         RatioTest::new(options.ratio_2d_to_3d, options.max_distance),
@@ -98,19 +99,15 @@ pub fn active_search(
 impl Search<'_> {
     /// 2D to 3D.
     fn points_for_features(&mut self, word: Word, test: &RatioTest) {
-        let listed = &self.snapshot.points_of_word[word as usize];
-        // A word is visited once.
-        let asking = std::mem::take(&mut self.features_of_word[word as usize]);
-        let queries: Vec<Descriptor> = asking.iter().map(|&f| self.features.descriptors[f as usize]).collect();
-        self.packed.repack_subset(&self.snapshot.descriptors, listed);
-        top2(&queries, &self.packed, &mut self.nearest);
+        let rows = &self.snapshot.rows_of_word;
         let mut fresh = Vec::new();
-        for (&feature, nearest) in asking.iter().zip(&self.nearest) {
+        for &feature in self.features_of_word.of(word) {
+            let Some(nearest) = rows.top2_of(&[word], &self.features.descriptors[feature as usize]) else { continue };
             // A list of one point offers nothing to compare with, so it proves nothing.
-            if nearest.second_distance_sq.is_none() || !test.accepts(nearest) {
+            if nearest.second_distance_sq.is_none() || !test.accepts(&nearest) {
                 continue;
             }
-            let point = listed[nearest.index as usize];
+            let point = rows.rank(nearest.index);
             let id = self.snapshot.ids[point as usize];
             if self.found.claim(KeypointIdx(feature), id, 1, nearest.distance_sq) {
                 fresh.push(point);
@@ -127,19 +124,12 @@ impl Search<'_> {
         if self.found.has_point(id) {
             return;
         }
-        let candidates = self.features_near(point);
-        self.packed.repack_subset(&self.features.descriptors, &candidates);
-        top2(&[self.snapshot.descriptors[point as usize]], &self.packed, &mut self.nearest);
-        let Some(&nearest) = self.nearest.first() else { return };
-        if nearest.second_distance_sq.is_some() && test.accepts(&nearest) {
-            self.found.claim(KeypointIdx(candidates[nearest.index as usize]), id, 1, nearest.distance_sq);
-        }
-    }
-
-    /// The features of the coarser words of a point.
-    fn features_near(&self, point: u32) -> Vec<u32> {
         let words = &self.snapshot.coarse_words_of_point[point as usize];
-        words.iter().flat_map(|&word| &self.features_of_coarse_word[word as usize]).copied().collect()
+        let rows = &self.rows_of_coarse_word;
+        let Some(nearest) = rows.top2_of(words, &self.snapshot.descriptors[point as usize]) else { return };
+        if nearest.second_distance_sq.is_some() && test.accepts(&nearest) {
+            self.found.claim(KeypointIdx(rows.rank(nearest.index)), id, 1, nearest.distance_sq);
+        }
     }
 
     /// Puts the points around a found one into the queue.
@@ -153,7 +143,7 @@ impl Search<'_> {
                 continue;
             }
             let words = &self.snapshot.coarse_words_of_point[neighbor as usize];
-            let cost: usize = words.iter().map(|&word| self.features_of_coarse_word[word as usize].len()).sum();
+            let cost: usize = words.iter().map(|&word| self.features_of_coarse_word.of(word).len()).sum();
             if cost > 1 {
                 self.queue.push(Reverse((cost, Task::Point(neighbor))));
             }

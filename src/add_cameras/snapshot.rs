@@ -10,6 +10,7 @@ use nalgebra::Vector3;
 use super::set_cover::set_cover;
 use super::vocabulary::{Vocabulary, Word};
 use super::{AddCamerasOptions, LoadFeatures};
+use crate::matching::descriptor::{CellLists, CellRows};
 use crate::scene::{DESCRIPTOR_LEN, Descriptor, Point3dId, Reconstruction};
 
 /// The searchable part of a model. Points are named by their rank in it.
@@ -23,7 +24,9 @@ pub struct ModelSnapshot {
     /// The visual words.
     pub vocabulary: Vocabulary,
     /// The points listed under each word, ascending.
-    pub points_of_word: Vec<Vec<u32>>,
+    pub points_of_word: CellLists,
+    /// Their mean descriptors by word.
+    pub rows_of_word: CellRows,
     /// The coarser words each point is listed under, ascending.
     pub coarse_words_of_point: Vec<Vec<Word>>,
     /// The positions, to find neighbours; none of a model without points.
@@ -52,22 +55,22 @@ impl ModelSnapshot {
                 words_of_point[rank as usize].push(word);
             }
         });
-        let mut points_of_word = vec![Vec::new(); vocabulary.num_words()];
         let mut coarse_words_of_point = Vec::with_capacity(ids.len());
-        for (rank, words) in (0u32..).zip(&mut words_of_point) {
+        for words in &mut words_of_point {
             words.sort_unstable();
             words.dedup();
-            for &word in words.iter() {
-                points_of_word[word as usize].push(rank);
-            }
             let mut coarse: Vec<Word> = words.iter().map(|&word| vocabulary.coarse_word_of(word)).collect();
             coarse.sort_unstable();
             coarse.dedup();
             coarse_words_of_point.push(coarse);
         }
+        let listed =
+            (0u32..).zip(&words_of_point).flat_map(|(rank, words)| words.iter().map(move |&word| (word, rank)));
+        let points_of_word = CellLists::new(vocabulary.num_words(), listed);
+        let rows_of_word = CellRows::pack(&descriptors, &points_of_word);
         let coordinates: Vec<[f64; 3]> = positions.iter().map(|x| [x.x, x.y, x.z]).collect();
         let tree = if ids.is_empty() { None } else { ImmutableKdTree::new_from_slice(&coordinates).ok() };
-        Self { ids, positions, descriptors, vocabulary, points_of_word, coarse_words_of_point, tree }
+        Self { ids, positions, descriptors, vocabulary, points_of_word, rows_of_word, coarse_words_of_point, tree }
     }
 
     /// Number of points.

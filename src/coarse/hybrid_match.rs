@@ -5,11 +5,15 @@
 //! pairs that do not overlap cost half; matching may also end there when the matches are enough for a geometry. Images of
 //! few features are matched in one go.
 //!
+//! Where many features are selected, they are matched by cells (`matching::cells`), all at once, as that costs less than
+//! the first half does otherwise; the first half's matches still decide on the pair.
+//!
 //! Departures: neighbours are exact instead of approximate, and the cross-check runs over all features matched so far, so
 //! a pair that goes through both batches has exactly the matches of an ordinary mutual matching.
 
 use serde::{Deserialize, Serialize};
 
+use crate::matching::cells::{CellOptions, CelledDescriptors, Codebook, match_in_cells};
 use crate::matching::descriptor::{PackedDescriptors, Top2, top2_both};
 use crate::matching::{MatchOptions, mutual_matches};
 use crate::scene::{Descriptor, KeypointIdx};
@@ -30,6 +34,10 @@ pub struct HybridMatchOptions {
     pub sufficient_matches: Option<usize>,
     /// An image with fewer selected features than this is matched all at once. 1000 in the paper.
     pub one_batch_below: usize,
+    /// How many selected features are matched; null to compare each with all, always. Ours.
+    pub cells: Option<CellOptions>,
+    /// Sets are matched by cells when this many features are selected of any image.
+    pub cells_from: usize,
 }
 
 impl Default for HybridMatchOptions {
@@ -40,6 +48,8 @@ impl Default for HybridMatchOptions {
             gate_matches: 4,
             sufficient_matches: None,
             one_batch_below: 1000,
+            cells: Some(CellOptions::default()),
+            cells_from: 1000,
         }
     }
 }
@@ -48,8 +58,24 @@ impl HybridMatchOptions {
     /// Adds a sentence for every value out of range.
     pub fn validate(&self, errors: &mut Vec<String>) {
         self.matching.validate(errors);
+        if let Some(cells) = &self.cells {
+            cells.validate(errors);
+        }
         if self.sufficient_matches.is_some_and(|sufficient| sufficient <= self.gate_matches) {
             errors.push(format!("sufficient_matches must be above gate_matches ({})", self.gate_matches));
+        }
+    }
+
+    /// How far a pair goes whose first batch gave so many matches.
+    fn extent_after_first(&self, matches: usize, is_all: bool) -> HybridExtent {
+        if is_all {
+            HybridExtent::Complete
+        } else if matches <= self.gate_matches {
+            HybridExtent::StoppedAtGate
+        } else if self.sufficient_matches.is_some_and(|sufficient| matches >= sufficient) {
+            HybridExtent::StoppedSufficient
+        } else {
+            HybridExtent::Complete
         }
     }
 }
@@ -58,13 +84,27 @@ impl HybridMatchOptions {
 #[derive(Clone, Debug)]
 pub struct CoarseDescriptors {
     descriptors: Vec<Descriptor>,
-    packed: PackedDescriptors,
+    layout: Layout,
+}
+
+/// How descriptors are laid out for matching.
+#[derive(Clone, Debug)]
+enum Layout {
+    /// In order.
+    Whole(PackedDescriptors),
+    /// By cell.
+    Celled(CelledDescriptors),
 }
 
 impl CoarseDescriptors {
-    /// From the selected descriptors (the first of the image, which are sorted by descending scale).
-    pub fn new(selected: &[Descriptor]) -> Self {
-        Self { descriptors: selected.to_vec(), packed: PackedDescriptors::pack(selected) }
+    /// From the selected descriptors (the first of the image, which are sorted by descending scale); by the cells of a codebook
+    /// where there is one, which must then be that of all images.
+    pub fn new(selected: &[Descriptor], codebook: Option<&Codebook>) -> Self {
+        let layout = match codebook {
+            Some(codebook) => Layout::Celled(CelledDescriptors::new(selected, codebook)),
+            None => Layout::Whole(PackedDescriptors::pack(selected)),
+        };
+        Self { descriptors: selected.to_vec(), layout }
     }
 
     /// Number of selected descriptors.
@@ -80,11 +120,6 @@ impl CoarseDescriptors {
     /// The selected descriptors.
     pub fn descriptors(&self) -> &[Descriptor] {
         &self.descriptors
-    }
-
-    /// The same, packed.
-    pub fn packed(&self) -> &PackedDescriptors {
-        &self.packed
     }
 }
 
@@ -110,31 +145,55 @@ pub struct HybridMatches {
 }
 
 /// Matches the coarse features of two images.
+///
+/// # Panics
+/// When one is laid out by cells and the other is not.
 pub fn match_hybrid(
     query: &CoarseDescriptors,
     reference: &CoarseDescriptors,
     options: &HybridMatchOptions,
 ) -> HybridMatches {
     let one_batch = !options.two_batches || query.len().min(reference.len()) < options.one_batch_below;
-    let (first, second) = query.descriptors.split_at(if one_batch { query.len() } else { query.len().div_ceil(2) });
+    let first_batch = if one_batch { query.len() } else { query.len().div_ceil(2) };
+    match (&query.layout, &reference.layout) {
+        (Layout::Celled(in_query), Layout::Celled(in_reference)) => {
+            let (query, reference) = ((query.descriptors(), in_query), (reference.descriptors(), in_reference));
+            let mut matches = match_in_cells(query, reference, &options.matching);
+            let in_first = matches.partition_point(|(keypoint, _)| keypoint.index() < first_batch);
+            let extent = options.extent_after_first(in_first, one_batch);
+            if extent != HybridExtent::Complete {
+                matches.truncate(in_first);
+            }
+            HybridMatches { matches, extent }
+        }
+        (Layout::Whole(_), Layout::Whole(reference)) => {
+            match_whole(&query.descriptors, first_batch, reference, options)
+        }
+        _ => panic!("descriptors by cells are matched with such alone"),
+    }
+}
+
+/// Matches the first batch with all of the reference, and, if that says so, the second.
+fn match_whole(
+    query: &[Descriptor],
+    first_batch: usize,
+    reference: &PackedDescriptors,
+    options: &HybridMatchOptions,
+) -> HybridMatches {
+    let (first, second) = query.split_at(first_batch);
     let (mut of_query, mut of_reference) = (Vec::new(), Vec::new());
-    top2_both(first, &reference.packed, &mut of_query, &mut of_reference);
+    top2_both(first, reference, &mut of_query, &mut of_reference);
     let test = options.matching.test();
     let matches_of = |of_query: &[Top2], of_reference: &[Top2]| {
         mutual_matches(of_query, options.matching.cross_check.then_some(of_reference), &test)
     };
     let matches = matches_of(&of_query, &of_reference);
-    if one_batch {
-        return HybridMatches { matches, extent: HybridExtent::Complete };
-    }
-    if matches.len() <= options.gate_matches {
-        return HybridMatches { matches, extent: HybridExtent::StoppedAtGate };
-    }
-    if options.sufficient_matches.is_some_and(|sufficient| matches.len() >= sufficient) {
-        return HybridMatches { matches, extent: HybridExtent::StoppedSufficient };
+    let extent = options.extent_after_first(matches.len(), second.is_empty());
+    if extent != HybridExtent::Complete || second.is_empty() {
+        return HybridMatches { matches, extent };
     }
     let (mut of_second, mut of_reference_later) = (Vec::new(), Vec::new());
-    top2_both(second, &reference.packed, &mut of_second, &mut of_reference_later);
+    top2_both(second, reference, &mut of_second, &mut of_reference_later);
     of_query.append(&mut of_second);
     for (found, mut later) in of_reference.iter_mut().zip(of_reference_later) {
         later.index += first.len() as u32;
@@ -167,7 +226,7 @@ mod tests {
         for rank in (0..1200).filter(|&rank| overlaps(rank)) {
             reference[rank] = sighting(&query[rank], &mut rng);
         }
-        (CoarseDescriptors::new(&query), CoarseDescriptors::new(&reference))
+        (CoarseDescriptors::new(&query, None), CoarseDescriptors::new(&reference, None))
     }
 
     #[test]
@@ -183,6 +242,19 @@ mod tests {
             assert_eq!(found.extent, HybridExtent::Complete);
             assert_eq!(found.matches.len(), 400);
             assert_eq!(found.matches, match_mutual(query.descriptors(), reference.descriptors(), &matching));
+        }
+    }
+
+    #[test]
+    fn by_cells_the_first_half_decides_too() {
+        let cells = CellOptions { visited: 1000, ..CellOptions::default() };
+        for (first_half, extent, count) in [(4, HybridExtent::StoppedAtGate, 4), (5, HybridExtent::Complete, 205)] {
+            let (query, reference) = pair(|rank| rank < first_half || rank >= 1000);
+            let codebook = Codebook::train(query.descriptors(), 8, &cells);
+            let by_cells = |image: &CoarseDescriptors| CoarseDescriptors::new(image.descriptors(), codebook.as_ref());
+            let found = match_hybrid(&by_cells(&query), &by_cells(&reference), &HybridMatchOptions::default());
+            assert_eq!((found.extent, found.matches.len()), (extent, count));
+            assert_eq!(found.matches, match_hybrid(&query, &reference, &HybridMatchOptions::default()).matches);
         }
     }
 
@@ -211,7 +283,7 @@ mod tests {
         let options = HybridMatchOptions { one_batch_below: 1201, ..Default::default() };
         let found = match_hybrid(&query, &reference, &options);
         assert_eq!(found.matches, [(KeypointIdx(1100), KeypointIdx(1100))]);
-        let none = CoarseDescriptors::new(&[]);
+        let none = CoarseDescriptors::new(&[], None);
         assert!(match_hybrid(&query, &none, &options).matches.is_empty());
         assert!(match_hybrid(&none, &reference, &HybridMatchOptions::default()).matches.is_empty());
     }

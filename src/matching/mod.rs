@@ -1,5 +1,7 @@
 //! Descriptor matching: exact nearest neighbours among descriptors, ratio test and cross-check.
 
+pub mod cells;
+pub mod clusters;
 pub mod descriptor;
 mod mutual;
 pub mod standing;

@@ -19,10 +19,11 @@ use crate::coarse::hybrid_match::{CoarseDescriptors, match_hybrid};
 use crate::coarse::pair_selection::{GeoPosition, PairingImage, select_pairs};
 use crate::coarse::rotation_cycles;
 use crate::coarse::selection::SelectionOptions;
+use crate::matching::cells::Codebook;
 use crate::matching::standing;
 use crate::matching::two_view::{self, TwoViewGeometry};
 use crate::math::Rng;
-use crate::scene::{CameraId, Features, ImageId, KeypointIdx};
+use crate::scene::{CameraId, Descriptor, Features, ImageId, KeypointIdx};
 
 /// The result of `coarse_match`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -44,6 +45,9 @@ const STREAM: u64 = 0x7477_6f5f_7669_6577;
 /// Images a side of a tile of pairs: with the default selection of 16K features, 64 images are 60 MB. Sets up to this size are
 /// one tile.
 const TILE_IMAGES: u32 = 64;
+
+/// Images that the codebook is found from at most, evenly spaced among all: enough to know the kinds of things the set shows.
+const CODEBOOK_IMAGES: usize = 64;
 
 /// Pairs of a unit of work: what a run that is stopped may have to do again, a few CPU seconds.
 const UNIT_PAIRS: usize = 256;
@@ -82,6 +86,12 @@ enum Standing {
     LeftOut,
     /// All that agree with each other.
     All,
+}
+
+/// At most so many of the items, evenly spaced.
+fn evenly<T>(items: &[T], count: usize) -> Vec<&T> {
+    let count = count.min(items.len());
+    (0..count).map(|at| &items[at * items.len() / count]).collect()
 }
 
 /// A pair and what was found.
@@ -125,7 +135,9 @@ impl Matcher<'_> {
             more(1);
             found
         };
-        let matched = self.for_pairs(&pairs, known, work, |unit, results| self.units.keep(&unit, results))?;
+        let codebook = self.codebook();
+        let matched =
+            self.for_pairs(&pairs, codebook.as_ref(), known, work, |unit, results| self.units.keep(&unit, results))?;
         self.context.check_cancelled()?;
 
         let mut result = CoarseMatches {
@@ -213,12 +225,31 @@ impl Matcher<'_> {
         select_pairs(&pairing, options).into_keys().collect()
     }
 
+    /// The codebook of the selected features; none where they are few, which are compared with all.
+    fn codebook(&self) -> Option<Codebook> {
+        let options = &self.options.matching;
+        let cells = options.cells.as_ref()?;
+        let selected: Vec<_> = self.usable().map(|(id, _, count)| (id, self.selection.num_selected(count))).collect();
+        let most = selected.iter().map(|&(_, count)| count).max().filter(|&most| most >= options.cells_from)?;
+        let num_cells = cells.num_cells(most);
+        let of_some = evenly(&selected, CODEBOOK_IMAGES);
+        let per_image = (cells.sample_per_cell * num_cells).div_ceil(of_some.len());
+        let sample: Vec<Vec<Descriptor>> = of_some
+            .par_iter()
+            .map(|&&(id, count)| {
+                let features = self.features.read(id, Some(count));
+                evenly(&features.descriptors, per_image).into_iter().copied().collect()
+            })
+            .collect();
+        Codebook::train(&sample.concat(), num_cells, cells)
+    }
+
     /// Reads the features of largest scale of an image.
-    fn select(&self, id: ImageId, camera: CameraId) -> Selected {
+    fn select(&self, id: ImageId, camera: CameraId, codebook: Option<&Codebook>) -> Selected {
         let count = self.found.get(&id).and_then(|image| image.count.as_ref().ok()).copied().unwrap_or(0);
         let features = self.features.read(id, Some(self.selection.num_selected(count)));
         let pixels = features.keypoints.iter().map(|at| Pixel::new(f64::from(at.x), f64::from(at.y))).collect();
-        Selected { pixels, descriptors: CoarseDescriptors::new(&features.descriptors), camera }
+        Selected { pixels, descriptors: CoarseDescriptors::new(&features.descriptors, codebook), camera }
     }
 
     /// Does `work` for every pair, in parallel, with the selected features of both images, unless the unit of work that
@@ -227,6 +258,7 @@ impl Matcher<'_> {
     fn for_pairs<T: Send>(
         &self,
         pairs: &[Pair],
+        codebook: Option<&Codebook>,
         mut known: impl FnMut(&[Pair]) -> Result<Option<Vec<(Pair, T)>>, PipelineError>,
         work: impl Fn(Pair, (&Selected, &Selected)) -> T + Sync,
         keep: impl Fn(&[Pair], &[(Pair, T)]) -> Result<(), PipelineError>,
@@ -251,7 +283,7 @@ impl Matcher<'_> {
             let same_tile = |id: &ImageId| needed.iter().any(|other| other.0 / TILE_IMAGES == id.0 / TILE_IMAGES);
             images.retain(|id, _| same_tile(id));
             let missing: Vec<ImageId> = needed.into_iter().filter(|id| !images.contains_key(id)).collect();
-            let read = missing.into_par_iter().map(|id| (id, self.select(id, cameras[&id])));
+            let read = missing.into_par_iter().map(|id| (id, self.select(id, cameras[&id], codebook)));
             images.extend(read.collect::<Vec<_>>());
             let of_unit = unit.par_iter().filter_map(|&(a, b)| {
                 let done = (!self.context.cancel.is_cancelled()).then(|| work((a, b), (&images[&a], &images[&b])));
@@ -329,7 +361,7 @@ impl Matcher<'_> {
         let pending: Vec<Pair> = graph.pairs.keys().filter(|(a, b)| !(trusted(a) && trusted(b))).copied().collect();
         let again =
             |pair, images: (&Selected, &Selected)| self.verify(pair, images, &graph.pairs[&pair].inliers, &cameras);
-        let verified = self.for_pairs(&pending, |_| Ok(None), again, |_, _| Ok(()))?;
+        let verified = self.for_pairs(&pending, None, |_| Ok(None), again, |_, _| Ok(()))?;
         for (pair, geometry) in verified {
             let Some(mut geometry) = geometry else { continue };
             let before = graph.pairs.remove(&pair).map(|before| before.inliers).unwrap_or_default();

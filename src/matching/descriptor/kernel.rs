@@ -9,7 +9,8 @@
 //! distances, and the final reduction takes the lowest index among equal lanes.
 
 use super::Top2;
-use super::packed::{GROUP_ROWS, Group, PADDING_BIAS, PackedDescriptors, norm_sq};
+use super::cells::{CellLists, CellRows};
+use super::packed::{GROUP_ROWS, Group, PADDING_BIAS, PackedDescriptors, fetch_early, norm_sq};
 use crate::scene::{DESCRIPTOR_LEN, Descriptor};
 
 /// Groups in a chunk: 64 * 2 KiB = 128 KiB of rows.
@@ -69,6 +70,28 @@ struct RowStates {
     query: Vec<[i32; GROUP_ROWS]>,
 }
 
+impl RowStates {
+    /// Of so many groups of rows that no query was seen of.
+    fn new(num_groups: usize) -> Self {
+        Self {
+            best: vec![[PADDING_BIAS; GROUP_ROWS]; num_groups],
+            second: vec![[PADDING_BIAS; GROUP_ROWS]; num_groups],
+            query: vec![[0; GROUP_ROWS]; num_groups],
+        }
+    }
+
+    /// The nearest queries of the row in a slot; none where there is no row, or no query was seen.
+    fn of(&self, slot: usize) -> Option<Top2> {
+        let of_slot = |values: &[[i32; GROUP_ROWS]]| values[slot / GROUP_ROWS][slot % GROUP_ROWS];
+        let (best, second) = (of_slot(&self.best), of_slot(&self.second));
+        (best < PADDING_LIMIT).then(|| Top2 {
+            index: of_slot(&self.query) as u32,
+            distance_sq: best as u32,
+            second_distance_sq: (second < PADDING_LIMIT).then_some(second as u32),
+        })
+    }
+}
+
 /// Nearest rows of every query.
 ///
 /// # Safety
@@ -94,25 +117,122 @@ pub(super) unsafe fn top2_both<K: Kernel, const Q: usize, const G: usize>(
     of_queries: &mut Vec<Top2>,
     of_rows: &mut Vec<Top2>,
 ) {
-    let num_groups = packed.num_groups();
-    let mut rows = RowStates {
-        best: vec![[PADDING_BIAS; GROUP_ROWS]; num_groups],
-        second: vec![[PADDING_BIAS; GROUP_ROWS]; num_groups],
-        query: vec![[0; GROUP_ROWS]; num_groups],
-    };
+    let mut rows = RowStates::new(packed.num_groups());
     // SAFETY: passed on to the caller.
     unsafe { scan::<K, Q, G>(queries, packed, of_queries, Some(&mut rows)) };
     of_rows.clear();
     if queries.is_empty() {
         return;
     }
-    let best = rows.best.as_flattened();
-    let (second, query) = (rows.second.as_flattened(), rows.query.as_flattened());
-    of_rows.extend((0..packed.len()).map(|row| Top2 {
-        index: query[row] as u32,
-        distance_sq: best[row] as u32,
-        second_distance_sq: (second[row] < PADDING_LIMIT).then_some(second[row] as u32),
-    }));
+    of_rows.extend((0..packed.len()).filter_map(|row| rows.of(row)));
+}
+
+/// Every squared distance, that of query q and row r at `q * packed.len() + r`. For few rows.
+///
+/// # Safety
+/// The machine must have the instructions of `K`.
+#[inline(always)]
+pub(super) unsafe fn distances_sq<K: Kernel, const Q: usize>(
+    queries: &[Descriptor],
+    packed: &PackedDescriptors,
+    out: &mut Vec<u32>,
+) {
+    out.clear();
+    out.resize(queries.len() * packed.len(), 0);
+    let (biases, _) = packed.biases.as_chunks::<GROUP_ROWS>();
+    for first in (0..queries.len()).step_by(Q) {
+        let used = (queries.len() - first).min(Q);
+        let (prepared, norms_sq) = block::<K, Q>(used, |q| &queries[first + q]);
+        for (group, biases) in biases.iter().enumerate() {
+            let first_row = group * GROUP_ROWS;
+            let num_rows = (packed.len() - first_row).min(GROUP_ROWS);
+            // SAFETY: passed on to the caller.
+            unsafe {
+                let dots = K::dots::<Q, 1>(&prepared, &[packed.group(group)]);
+                let biases = K::load(biases);
+                for q in 0..used {
+                    let mut distances = [0; GROUP_ROWS];
+                    let of_rows = K::add(K::minus_twice(biases, dots[q][0]), K::splat(norms_sq[q]));
+                    K::store(of_rows, &mut distances);
+                    let start = (first + q) * packed.len() + first_row;
+                    for (out, distance_sq) in out[start..start + num_rows].iter_mut().zip(distances) {
+                        *out = distance_sq as u32;
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Of every query its nearest rows among those of the cells that it visits, and of every slot its nearest queries among those
+/// that visit its cell.
+///
+/// # Safety
+/// The machine must have the instructions of `K`.
+#[inline(always)]
+pub(super) unsafe fn top2_in_cells<K: Kernel, const Q: usize, const G: usize>(
+    queries: &[Descriptor],
+    visitors: &CellLists,
+    rows: &CellRows,
+    of_queries: &mut Vec<Option<Top2>>,
+    of_slots: &mut Vec<Option<Top2>>,
+) {
+    let packed = &rows.packed;
+    let mut states = RowStates::new(packed.num_groups());
+    of_queries.clear();
+    of_queries.resize(queries.len(), None);
+    for cell in 0..rows.num_cells() as u32 {
+        let (visiting, groups) = (visitors.of(cell), rows.groups_of(cell));
+        for chunk in groups.clone().step_by(CHUNK_GROUPS) {
+            let chunk_end = (chunk + CHUNK_GROUPS).min(groups.end);
+            for first in (0..visiting.len()).step_by(Q) {
+                let (block_of, later) = visiting[first..].split_at(Q.min(visiting.len() - first));
+                for &query in &later[..Q.min(later.len())] {
+                    fetch_early(&queries[query as usize]);
+                }
+                let (prepared, norms_sq) = block::<K, Q>(block_of.len(), |q| &queries[block_of[q] as usize]);
+                // SAFETY: passed on to the caller.
+                let found = unsafe {
+                    scan_block::<K, Q, G>(&prepared, &norms_sq, first, packed, chunk..chunk_end, Some(&mut states))
+                };
+                for (found, &query) in found.into_iter().zip(block_of) {
+                    let before = &mut of_queries[query as usize];
+                    *before = Some(before.map_or(found, |before| before.joined_with(found)));
+                }
+            }
+        }
+    }
+    of_slots.clear();
+    for cell in 0..rows.num_cells() as u32 {
+        let (visiting, groups) = (visitors.of(cell), rows.groups_of(cell));
+        let slots = groups.start * GROUP_ROWS..groups.end * GROUP_ROWS;
+        of_slots.extend(
+            slots.map(|slot| states.of(slot).map(|found| Top2 { index: visiting[found.index as usize], ..found })),
+        );
+    }
+}
+
+/// The nearest rows of a few cells to one query.
+///
+/// # Safety
+/// The machine must have the instructions of `K`.
+#[inline(always)]
+pub(super) unsafe fn top2_of_cells<K: Kernel, const G: usize>(
+    query: &Descriptor,
+    cells: &[u32],
+    rows: &CellRows,
+) -> Option<Top2> {
+    let (prepared, norms_sq) = block::<K, 1>(1, |_| query);
+    let mut nearest: Option<Top2> = None;
+    for &cell in cells {
+        let groups = rows.groups_of(cell);
+        if !groups.is_empty() {
+            // SAFETY: passed on to the caller.
+            let [found] = unsafe { scan_block::<K, 1, G>(&prepared, &norms_sq, 0, &rows.packed, groups, None) };
+            nearest = Some(nearest.map_or(found, |before| before.joined_with(found)));
+        }
+    }
+    nearest
 }
 
 #[inline(always)]
@@ -259,10 +379,13 @@ pub(super) unsafe fn reduce<K: Kernel>(running: &Running<K::Lanes>) -> Top2 {
         let row = group * GROUP_ROWS as i32 + lane as i32;
         index = index.min(if best == nearest { row } else { i32::MAX });
     }
+    // In the winner's lane its own second takes the place of the best. By comparison: storing it there would make the vector that
+    // is read next wait for a single lane.
     let winner = index as usize % GROUP_ROWS;
-    // In the winner's lane its own second takes the place of the best.
-    best[winner] = second[winner];
-    let runner_up = best.into_iter().fold(i32::MAX, i32::min);
+    let mut runner_up = i32::MAX;
+    for (lane, (&best, &second)) in best.iter().zip(&second).enumerate() {
+        runner_up = runner_up.min(if lane == winner { second } else { best });
+    }
     Top2 {
         index: index as u32,
         distance_sq: nearest as u32,

@@ -22,6 +22,7 @@
 //! quarters of that, and 1.5 with AVX-VNNI (`cargo bench --bench matching`).
 
 mod banded;
+mod cells;
 mod kernel;
 #[cfg(target_arch = "aarch64")]
 mod neon;
@@ -34,6 +35,7 @@ mod tier;
 mod x86;
 
 pub use banded::{BandQuery, BandTop2, BandedRows, NearestQueries, nearest_off_bands, top2_in_bands};
+pub use cells::{CellLists, CellRows, top2_in_cells};
 pub use packed::PackedDescriptors;
 pub use tier::Tier;
 
@@ -76,6 +78,12 @@ pub fn top2_both(
     of_rows: &mut Vec<Top2>,
 ) {
     Tier::detected().top2_both(queries, packed, of_queries, of_rows);
+}
+
+/// Every squared distance, that of query q and row r at `q * packed.len() + r` of `out` (cleared first), with the fastest
+/// instructions of this machine. For few rows.
+pub fn distances_sq(queries: &[Descriptor], packed: &PackedDescriptors, out: &mut Vec<u32>) {
+    Tier::detected().distances_sq(queries, packed, out);
 }
 
 /// The squared distance from a query to the nearest of the rows `descriptors[indices[0]], ...`; none when there are none. For a

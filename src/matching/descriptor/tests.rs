@@ -218,3 +218,82 @@ fn every_tier_agrees_on_bands() {
         }
     }
 }
+
+/// Ranks 0 to `n` in some of the cells each, ascending.
+fn cells_of(rng: &mut Rng, n: usize, num_cells: usize) -> Vec<(u32, u32)> {
+    let mut entries = Vec::new();
+    for rank in 0..n as u32 {
+        entries.extend((0..num_cells as u32).filter(|_| rng.below(3) == 0).map(|cell| (cell, rank)));
+    }
+    entries
+}
+
+#[test]
+fn every_tier_agrees_within_cells() {
+    let mut rng = Rng::from_parts(&[12]);
+    for (num_queries, num_rows, num_cells) in [(1, 1, 1), (9, 40, 3), (30, 5, 7), (70, 300, 4), (0, 20, 2), (20, 0, 2)]
+    {
+        let (queries, rows) = (descriptors(&mut rng, num_queries), descriptors(&mut rng, num_rows));
+        let visits = cells_of(&mut rng, num_queries, num_cells);
+        let own: Vec<(u32, u32)> = (0..num_rows as u32).map(|row| (rng.below(num_cells) as u32, row)).collect();
+        let visitors = CellLists::new(num_cells, visits.iter().copied());
+        let celled = CellRows::pack(&rows, &CellLists::new(num_cells, own.iter().copied()));
+        // By definition: best and second of what shares a cell.
+        let nearest = |query: &Descriptor, cells: &[u32]| {
+            let seen = own.iter().filter(|(cell, _)| cells.contains(cell)).map(|&(_, row)| row);
+            let mut distances: Vec<u32> = seen.map(|row| distance_sq(query, &rows[row as usize])).collect();
+            distances.sort_unstable();
+            Some((*distances.first()?, distances.get(1).copied()))
+        };
+        let visited = |query: usize| -> Vec<u32> {
+            visits.iter().filter(|&&(_, rank)| rank as usize == query).map(|&(cell, _)| cell).collect()
+        };
+        let told = |found: &Top2| (found.distance_sq, found.second_distance_sq);
+        for &tier in Tier::ALL.iter().filter(|tier| tier.is_available()) {
+            let (mut of_queries, mut of_slots) = (Vec::new(), Vec::new());
+            tier.top2_in_cells(&queries, &visitors, &celled, &mut of_queries, &mut of_slots);
+            assert_eq!(of_queries.len(), num_queries);
+            for (at, (query, found)) in queries.iter().zip(&of_queries).enumerate() {
+                assert_eq!(found.as_ref().map(told), nearest(query, &visited(at)), "{tier:?} {at}");
+                assert_eq!(&tier.top2_of_cells(query, &visited(at), &celled), found, "{tier:?} {at}");
+                if let Some(found) = found {
+                    let row = celled.rank(found.index) as usize;
+                    assert_eq!(distance_sq(query, &rows[row]), found.distance_sq, "{tier:?} {at}");
+                }
+            }
+            let slots = own.iter().map(|&(cell, row)| {
+                let of_row = |slot: &usize| celled.rank(*slot as u32) == row;
+                ((0..of_slots.len()).find(of_row).unwrap(), cell, row)
+            });
+            for (slot, cell, row) in slots {
+                let mut asked: Vec<(u32, u32)> = visitors
+                    .of(cell)
+                    .iter()
+                    .map(|&query| (distance_sq(&queries[query as usize], &rows[row as usize]), query))
+                    .collect();
+                asked.sort_unstable();
+                let expected = asked.first().map(|&(distance_sq, index)| Top2 {
+                    index,
+                    distance_sq,
+                    second_distance_sq: asked.get(1).map(|second| second.0),
+                });
+                assert_eq!(of_slots[slot], expected, "{tier:?} row {row}");
+            }
+        }
+    }
+}
+
+#[test]
+fn every_tier_agrees_on_all_distances() {
+    let mut rng = Rng::from_parts(&[13]);
+    for (num_queries, num_rows) in [(1, 1), (7, 16), (13, 50), (0, 3), (3, 0)] {
+        let (queries, rows) = (descriptors(&mut rng, num_queries), descriptors(&mut rng, num_rows));
+        let expected: Vec<u32> =
+            queries.iter().flat_map(|query| rows.iter().map(|row| distance_sq(query, row))).collect();
+        for &tier in Tier::ALL.iter().filter(|tier| tier.is_available()) {
+            let mut out = vec![7];
+            tier.distances_sq(&queries, &PackedDescriptors::pack(&rows), &mut out);
+            assert_eq!(out, expected, "{tier:?} {num_queries} {num_rows}");
+        }
+    }
+}

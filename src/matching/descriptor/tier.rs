@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::sync::LazyLock;
 
 use super::banded::{self, BandQuery, BandTop2, BandedRows, NearestQueries};
+use super::cells::{CellLists, CellRows};
 use super::scalar::{self, Scalar};
 use super::{PackedDescriptors, Top2, kernel};
 use crate::scene::Descriptor;
@@ -117,6 +118,81 @@ impl Tier {
         }
     }
 
+    /// [`super::distances_sq`] with these instructions.
+    ///
+    /// # Panics
+    /// When the machine lacks them.
+    pub fn distances_sq(self, queries: &[Descriptor], packed: &PackedDescriptors, out: &mut Vec<u32>) {
+        self.assert_available();
+        // SAFETY: the instructions are there.
+        unsafe {
+            match self {
+                Self::Scalar => kernel::distances_sq::<Scalar, 4>(queries, packed, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx2 => x86::distances_avx2(queries, packed, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::AvxVnni => x86::distances_avx_vnni(queries, packed, out),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Vnni => x86::distances_avx512_vnni(queries, packed, out),
+                #[cfg(target_arch = "aarch64")]
+                Self::Neon => kernel::distances_sq::<super::neon::Neon, 6>(queries, packed, out),
+            }
+        }
+    }
+
+    /// [`super::top2_in_cells`] with these instructions.
+    ///
+    /// # Panics
+    /// When the machine lacks them.
+    pub fn top2_in_cells(
+        self,
+        queries: &[Descriptor],
+        visitors: &CellLists,
+        rows: &CellRows,
+        of_queries: &mut Vec<Option<Top2>>,
+        of_slots: &mut Vec<Option<Top2>>,
+    ) {
+        self.assert_available();
+        // SAFETY: the instructions are there.
+        unsafe {
+            match self {
+                Self::Scalar => kernel::top2_in_cells::<Scalar, 4, 1>(queries, visitors, rows, of_queries, of_slots),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx2 => x86::in_cells_avx2(queries, visitors, rows, of_queries, of_slots),
+                #[cfg(target_arch = "x86_64")]
+                Self::AvxVnni => x86::in_cells_avx_vnni(queries, visitors, rows, of_queries, of_slots),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Vnni => x86::in_cells_avx512_vnni(queries, visitors, rows, of_queries, of_slots),
+                #[cfg(target_arch = "aarch64")]
+                Self::Neon => {
+                    kernel::top2_in_cells::<super::neon::Neon, 6, 1>(queries, visitors, rows, of_queries, of_slots);
+                }
+            }
+        }
+    }
+
+    /// [`CellRows::top2_of`] with these instructions.
+    ///
+    /// # Panics
+    /// When the machine lacks them.
+    pub fn top2_of_cells(self, query: &Descriptor, cells: &[u32], rows: &CellRows) -> Option<Top2> {
+        self.assert_available();
+        // SAFETY: the instructions are there.
+        unsafe {
+            match self {
+                Self::Scalar => kernel::top2_of_cells::<Scalar, 1>(query, cells, rows),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx2 => x86::of_cells_avx2(query, cells, rows),
+                #[cfg(target_arch = "x86_64")]
+                Self::AvxVnni => x86::of_cells_avx_vnni(query, cells, rows),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Vnni => x86::of_cells_avx512_vnni(query, cells, rows),
+                #[cfg(target_arch = "aarch64")]
+                Self::Neon => kernel::top2_of_cells::<super::neon::Neon, 2>(query, cells, rows),
+            }
+        }
+    }
+
     /// [`super::least_distance_sq`] with these instructions.
     ///
     /// # Panics
@@ -203,6 +279,7 @@ mod x86 {
     use std::ops::Range;
 
     use super::super::banded::{self, BandQuery, BandTop2, BandedRows, NearestQueries};
+    use super::super::cells::{CellLists, CellRows};
     use super::super::x86::{Avx2, Avx512Vnni, AvxVnni};
     use super::super::{PackedDescriptors, Top2, kernel, scalar};
     use crate::scene::Descriptor;
@@ -224,6 +301,37 @@ mod x86 {
             ) {
                 // SAFETY: this function is only called on machines that have its features.
                 unsafe { kernel::top2_both::<$kernel, $queries, $groups>(queries, packed, of_queries, of_rows) }
+            }
+        };
+    }
+
+    macro_rules! compile_celled {
+        ($features:literal, $kernel:ty, $queries:literal, $groups:literal, $distances:ident, $in_cells:ident, $of_cells:ident) => {
+            /// Four groups at a time: one alone waits for its own sums.
+            #[target_feature(enable = $features)]
+            pub(super) fn $of_cells(query: &Descriptor, cells: &[u32], rows: &CellRows) -> Option<Top2> {
+                // SAFETY: this function is only called on machines that have its features.
+                unsafe { kernel::top2_of_cells::<$kernel, 4>(query, cells, rows) }
+            }
+
+            #[target_feature(enable = $features)]
+            pub(super) fn $distances(queries: &[Descriptor], packed: &PackedDescriptors, out: &mut Vec<u32>) {
+                // SAFETY: this function is only called on machines that have its features.
+                unsafe { kernel::distances_sq::<$kernel, $queries>(queries, packed, out) }
+            }
+
+            #[target_feature(enable = $features)]
+            pub(super) fn $in_cells(
+                queries: &[Descriptor],
+                visitors: &CellLists,
+                rows: &CellRows,
+                of_queries: &mut Vec<Option<Top2>>,
+                of_slots: &mut Vec<Option<Top2>>,
+            ) {
+                // SAFETY: this function is only called on machines that have its features.
+                unsafe {
+                    kernel::top2_in_cells::<$kernel, $queries, $groups>(queries, visitors, rows, of_queries, of_slots)
+                }
             }
         };
     }
@@ -264,6 +372,17 @@ mod x86 {
         scalar::least_distance_sq(query, descriptors, indices)
     }
 
+    compile_celled!("avx2", Avx2, 4, 1, distances_avx2, in_cells_avx2, of_cells_avx2);
+    compile_celled!("avx2,avxvnni", AvxVnni, 5, 1, distances_avx_vnni, in_cells_avx_vnni, of_cells_avx_vnni);
+    compile_celled!(
+        "avx512f,avx512bw,avx512vnni",
+        Avx512Vnni,
+        6,
+        2,
+        distances_avx512_vnni,
+        in_cells_avx512_vnni,
+        of_cells_avx512_vnni
+    );
     compile_banded!("avx2", Avx2, 4, in_bands_avx2, off_bands_avx2);
     compile_banded!("avx2,avxvnni", AvxVnni, 4, in_bands_avx_vnni, off_bands_avx_vnni);
     compile_banded!("avx512f,avx512bw,avx512vnni", Avx512Vnni, 8, in_bands_avx512_vnni, off_bands_avx512_vnni);
