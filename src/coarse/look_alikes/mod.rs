@@ -20,6 +20,7 @@
 //! Cheong, "Seeing Double Without Confusion", CVPR 2012. Nothing depends on the order of the photographs or on when
 //! they were taken.
 
+mod forest;
 mod judgement;
 mod options;
 mod skeleton;

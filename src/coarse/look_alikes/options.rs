@@ -23,7 +23,7 @@ pub struct LookAlikeOptions {
     /// The doubted pairs are judged only when one of them agrees in this share or less: then the set holds look-alikes, or a
     /// chain that comes back. Judging costs a coarse model.
     pub alarming_share: f64,
-    /// A pair that a chain contradicts is a rival of the chain's weakest link when it has at least this share of its strength ...
+    /// A pair that a chain contradicts is a rival of a link of the chain when it has at least this share of its strength ...
     pub rival_share: f64,
     /// ... and at least so many times its matches. Origin of both: measured; where a link was wrong, true pairs had 0.7 of its
     /// strength and four times its matches, and wrong pairs of two sets of copies have at most 0.44 of that of a true link.

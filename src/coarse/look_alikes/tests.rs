@@ -241,7 +241,6 @@ fn a_cut_pair_shares_a_place_only_when_enough_of_its_matches_do() {
         known: 100,
         agreeing: 0,
         strength: 0.1,
-        link: (ImageId(0), ImageId(2)),
         chain_strength: 0.5,
     };
     let options = LookAlikeOptions::default();
