@@ -17,7 +17,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::clusters::k_means;
-use super::descriptor::{CellLists, CellRows, PackedDescriptors, Top2, distances_sq, top2, top2_in_cells};
+use super::descriptor::{CellLists, CellRows, PackedDescriptors, Top2, distances_sq, top2_in_cells};
 use super::{MatchOptions, RatioTest};
 use crate::scene::{Descriptor, KeypointIdx};
 
@@ -154,7 +154,7 @@ fn keep_nearest_of_all(
 ) {
     let doubted: Vec<Descriptor> = matches.iter().map(|pair| queries[query_and_row(pair).0 as usize]).collect();
     let mut nearest = Vec::new();
-    top2(&doubted, rows.packed(), &mut nearest);
+    rows.top2(&doubted, &mut nearest);
     let mut nearest = nearest.iter();
     matches.retain(|pair| {
         nearest.next().is_some_and(|found| rows.rank(found.index) == query_and_row(pair).1 && test.accepts(found))

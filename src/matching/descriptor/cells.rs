@@ -87,9 +87,10 @@ impl CellRows {
         rows
     }
 
-    /// All rows, by slot: what is found among these has slots for indices.
-    pub fn packed(&self) -> &PackedDescriptors {
-        &self.packed
+    /// For every query the nearest and second-nearest of all rows, into `out` (cleared first), with the fastest instructions of
+    /// this machine. The indices are slots. `out` stays empty when there are no rows.
+    pub fn top2(&self, queries: &[Descriptor], out: &mut Vec<Top2>) {
+        Tier::detected().top2(queries, &self.packed, out);
     }
 
     /// The rank of the row in a slot.

@@ -306,7 +306,10 @@ mod x86 {
     }
 
     macro_rules! compile_celled {
-        ($features:literal, $kernel:ty, $queries:literal, $groups:literal, $distances:ident, $in_cells:ident, $of_cells:ident) => {
+        (
+            $features:literal, $kernel:ty, $queries:literal, $groups:literal, $distances:ident, $in_cells:ident,
+            $of_cells:ident
+        ) => {
             /// Four groups at a time: one alone waits for its own sums.
             #[target_feature(enable = $features)]
             pub(super) fn $of_cells(query: &Descriptor, cells: &[u32], rows: &CellRows) -> Option<Top2> {
