@@ -27,7 +27,8 @@ use super::correspondences::{Correspondence, OneToOne};
 use super::vocabulary::Word;
 use super::{ActiveSearchOptions, ModelSnapshot};
 use crate::matching::RatioTest;
-use crate::matching::descriptor::{CellLists, CellRows};
+use crate::matching::descriptor::CellRows;
+use crate::math::Grouped;
 use crate::scene::{Features, KeypointIdx};
 
 /// A place in the queue: ties in cost go to the 2D-to-3D direction, then to the lower number.
@@ -44,8 +45,8 @@ struct Search<'a> {
     snapshot: &'a ModelSnapshot,
     features: &'a Features,
     options: &'a ActiveSearchOptions,
-    features_of_word: CellLists,
-    features_of_coarse_word: CellLists,
+    features_of_word: Grouped<u32>,
+    features_of_coarse_word: Grouped<u32>,
     rows_of_coarse_word: CellRows,
     queue: BinaryHeap<Reverse<(usize, Task)>>,
     queued_points: Vec<bool>,
@@ -61,13 +62,13 @@ pub fn active_search(
     let vocabulary = &snapshot.vocabulary;
     let words = vocabulary.words_of(&features.descriptors);
     let seen = || words.iter().copied().zip(0u32..);
-    let features_of_word = CellLists::new(vocabulary.num_words(), seen());
+    let features_of_word = Grouped::new(vocabulary.num_words(), seen());
     let coarse = seen().map(|(word, feature)| (vocabulary.coarse_word_of(word), feature));
-    let features_of_coarse_word = CellLists::new(vocabulary.num_coarse_words(), coarse);
+    let features_of_coarse_word = Grouped::new(vocabulary.num_coarse_words(), coarse);
     let mut queue = BinaryHeap::new();
     for word in 0..vocabulary.num_words() as Word {
-        let listed = snapshot.points_of_word.of(word).len();
-        if !features_of_word.of(word).is_empty() && listed > 0 {
+        let listed = snapshot.points_of_word.group(word as usize).len();
+        if !features_of_word.group(word as usize).is_empty() && listed > 0 {
             queue.push(Reverse((listed, Task::FeaturesOfWord(word))));
         }
     }
@@ -101,7 +102,7 @@ impl Search<'_> {
     fn points_for_features(&mut self, word: Word, test: &RatioTest) {
         let rows = &self.snapshot.rows_of_word;
         let mut fresh = Vec::new();
-        for &feature in self.features_of_word.of(word) {
+        for &feature in self.features_of_word.group(word as usize) {
             let Some(nearest) = rows.top2_of(&[word], &self.features.descriptors[feature as usize]) else { continue };
             // A list of one point offers nothing to compare with, so it proves nothing.
             if nearest.second_distance_sq.is_none() || !test.accepts(&nearest) {
@@ -143,7 +144,7 @@ impl Search<'_> {
                 continue;
             }
             let words = &self.snapshot.coarse_words_of_point[neighbor as usize];
-            let cost: usize = words.iter().map(|&word| self.features_of_coarse_word.of(word).len()).sum();
+            let cost: usize = words.iter().map(|&word| self.features_of_coarse_word.group(word as usize).len()).sum();
             if cost > 1 {
                 self.queue.push(Reverse((cost, Task::Point(neighbor))));
             }

@@ -10,7 +10,8 @@ use nalgebra::Vector3;
 use super::set_cover::set_cover;
 use super::vocabulary::{Vocabulary, Word};
 use super::{AddCamerasOptions, LoadFeatures};
-use crate::matching::descriptor::{CellLists, CellRows};
+use crate::matching::descriptor::CellRows;
+use crate::math::Grouped;
 use crate::scene::{DESCRIPTOR_LEN, Descriptor, Point3dId, Reconstruction};
 
 /// The searchable part of a model. Points are named by their rank in it.
@@ -24,7 +25,7 @@ pub struct ModelSnapshot {
     /// The visual words.
     pub vocabulary: Vocabulary,
     /// The points listed under each word, ascending.
-    pub points_of_word: CellLists,
+    pub points_of_word: Grouped<u32>,
     /// Their mean descriptors by word.
     pub rows_of_word: CellRows,
     /// The coarser words each point is listed under, ascending.
@@ -66,7 +67,7 @@ impl ModelSnapshot {
         }
         let listed =
             (0u32..).zip(&words_of_point).flat_map(|(rank, words)| words.iter().map(move |&word| (word, rank)));
-        let points_of_word = CellLists::new(vocabulary.num_words(), listed);
+        let points_of_word = Grouped::new(vocabulary.num_words(), listed);
         let rows_of_word = CellRows::pack(&descriptors, &points_of_word);
         let coordinates: Vec<[f64; 3]> = positions.iter().map(|x| [x.x, x.y, x.z]).collect();
         let tree = if ids.is_empty() { None } else { ImmutableKdTree::new_from_slice(&coordinates).ok() };

@@ -275,7 +275,7 @@ fn a_point_is_the_mean_of_its_sightings_and_listed_under_their_words() {
             assert!((f64::from(snapshot.descriptors[rank][byte]) - mean).abs() <= 0.5);
         }
         for word in snapshot.vocabulary.words_of(&seen) {
-            assert!(snapshot.points_of_word.of(word).contains(&(rank as u32)));
+            assert!(snapshot.points_of_word.group(word as usize).contains(&(rank as u32)));
             let coarse = snapshot.vocabulary.coarse_word_of(word);
             assert!(snapshot.coarse_words_of_point[rank].contains(&coarse));
         }

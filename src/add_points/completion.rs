@@ -20,7 +20,6 @@ use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::grouped::Grouped;
 use super::merge::{TrackUpdate, apply_updates};
 use super::options::{AddPointsOptions, CandidatePairOptions};
 use super::pair_matcher::image_of_features;
@@ -29,6 +28,7 @@ use super::views::{Sighting, ViewTable};
 use super::{AddPointsError, Cancelled, LoadFeatures, PairOfSightings, candidate_pairs};
 use crate::camera::{Camera, Pixel};
 use crate::matching::descriptor::distance_sq;
+use crate::math::Grouped;
 use crate::scene::{Descriptor, ImageId, KeypointIdx, Observation, Point3d, Point3dId, Reconstruction};
 
 /// Points of a block: the descriptors of a tenth to a half of them are compared, half a kilobyte each.
@@ -342,7 +342,7 @@ impl<'a> FreeKeypoints<'a> {
         let free = (0u32..).zip(image.points()).filter(|(_, point)| point.is_none()).map(|(keypoint, _)| keypoint);
         let free: Vec<(u32, u32)> =
             free.map(|keypoint| (cell_of(&image.keypoints[keypoint as usize].0), keypoint)).collect();
-        let cells = Grouped::new(columns * rows, free);
+        let cells = Grouped::new(columns * rows, free.into_iter());
         Self { keypoints: &image.keypoints, radius_px, cell_px, columns, rows, cells }
     }
 

@@ -2,10 +2,9 @@
 
 use std::collections::HashMap;
 
-use super::grouped::Grouped;
 use super::stars::StarTracks;
 use super::views::ViewTable;
-use crate::math::UnionFind;
+use crate::math::{Grouped, UnionFind};
 use crate::scene::{Observation, Point3dId, Reconstruction};
 
 /// The components with at least one track, in the order of their first.
@@ -41,12 +40,12 @@ impl Components {
         });
         let of_points: Vec<(u32, Point3dId)> = of_points.collect();
         let count = of_root.len();
-        Self { stars: Grouped::new(count, of_stars), points: Grouped::new(count, of_points) }
+        Self { stars: Grouped::new(count, of_stars.into_iter()), points: Grouped::new(count, of_points.into_iter()) }
     }
 
     /// How many.
     pub fn len(&self) -> usize {
-        self.stars.len()
+        self.stars.num_groups()
     }
 
     /// The numbers of a component's tracks and the ids of its points, both ascending.

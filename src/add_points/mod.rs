@@ -23,7 +23,6 @@ pub mod completion;
 mod components;
 pub mod epipolar;
 pub mod grid;
-mod grouped;
 pub mod guided_match;
 pub mod line_groups;
 pub mod merge;

@@ -17,8 +17,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::clusters::k_means;
-use super::descriptor::{CellLists, CellRows, PackedDescriptors, Top2, distances_sq, top2_in_cells};
+use super::descriptor::{CellRows, PackedDescriptors, Top2, distances_sq, top2_in_cells};
 use super::{MatchOptions, RatioTest};
+use crate::math::Grouped;
 use crate::scene::{Descriptor, KeypointIdx};
 
 /// How descriptor space is divided.
@@ -103,7 +104,7 @@ impl Codebook {
 /// An image's descriptors by cell, ready to be either side of a pair. Built once per image.
 #[derive(Clone, Debug)]
 pub struct CelledDescriptors {
-    visitors: CellLists,
+    visitors: Grouped<u32>,
     rows: CellRows,
 }
 
@@ -115,8 +116,8 @@ impl CelledDescriptors {
         let all = visits.clone().flat_map(|(rank, cells)| cells.iter().map(move |&cell| (cell, rank)));
         let own = visits.map(|(rank, cells)| (cells[0], rank));
         Self {
-            visitors: CellLists::new(num_cells, all),
-            rows: CellRows::pack(descriptors, &CellLists::new(num_cells, own)),
+            visitors: Grouped::new(num_cells, all),
+            rows: CellRows::pack(descriptors, &Grouped::new(num_cells, own)),
         }
     }
 }

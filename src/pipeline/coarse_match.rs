@@ -97,11 +97,23 @@ fn evenly<T>(items: &[T], count: usize) -> Vec<&T> {
 /// A pair and what was found.
 type Matched = (Pair, Found);
 
+/// Where the selected features of an image lie.
+struct Positions {
+    pixels: Vec<Pixel>,
+    camera: CameraId,
+}
+
 /// The selected features of an image. Only those of a tile of pairs are in memory at a time.
 struct Selected {
     descriptors: CoarseDescriptors,
-    pixels: Vec<Pixel>,
-    camera: CameraId,
+    positions: Positions,
+}
+
+impl Positions {
+    fn new(features: &Features, camera: CameraId) -> Self {
+        let pixels = features.keypoints.iter().map(|at| Pixel::new(f64::from(at.x), f64::from(at.y))).collect();
+        Self { pixels, camera }
+    }
 }
 
 impl Matcher<'_> {
@@ -131,13 +143,17 @@ impl Matcher<'_> {
         };
         let work = |(a, b): Pair, (in_a, in_b): (&Selected, &Selected)| {
             let matches = match_hybrid(&in_a.descriptors, &in_b.descriptors, &self.options.matching).matches;
-            let found = self.verify_moved((a, b), (in_a, in_b), &matches);
+            let found = self.verify_moved((a, b), (&in_a.positions, &in_b.positions), &matches);
             more(1);
             found
         };
         let codebook = self.codebook();
-        let matched =
-            self.for_pairs(&pairs, codebook.as_ref(), known, work, |unit, results| self.units.keep(&unit, results))?;
+        let select = |id, camera| {
+            let features = self.selected(id);
+            let descriptors = CoarseDescriptors::new(&features.descriptors, codebook.as_ref());
+            Selected { descriptors, positions: Positions::new(&features, camera) }
+        };
+        let matched = self.for_pairs(&pairs, select, known, work, |unit, results| self.units.keep(&unit, results))?;
         self.context.check_cancelled()?;
 
         let mut result = CoarseMatches {
@@ -245,22 +261,20 @@ impl Matcher<'_> {
     }
 
     /// Reads the features of largest scale of an image.
-    fn select(&self, id: ImageId, camera: CameraId, codebook: Option<&Codebook>) -> Selected {
+    fn selected(&self, id: ImageId) -> Features {
         let count = self.found.get(&id).and_then(|image| image.count.as_ref().ok()).copied().unwrap_or(0);
-        let features = self.features.read(id, Some(self.selection.num_selected(count)));
-        let pixels = features.keypoints.iter().map(|at| Pixel::new(f64::from(at.x), f64::from(at.y))).collect();
-        Selected { pixels, descriptors: CoarseDescriptors::new(&features.descriptors, codebook), camera }
+        self.features.read(id, Some(self.selection.num_selected(count)))
     }
 
-    /// Does `work` for every pair, in parallel, with the selected features of both images, unless the unit of work that
-    /// the pair belongs to is `known`; a unit that is done is `kept`. Pairs are done in tiles of images that share what
+    /// Does `work` for every pair, in parallel, with what is `read` of both images, unless the unit of work that the pair
+    /// belongs to is `known`; a unit that is done is `kept`. Pairs are done in tiles of images that share what
     /// was read, so that memory does not grow with the number of images. Once cancelled, what is left is left out.
-    fn for_pairs<T: Send>(
+    fn for_pairs<I: Send + Sync, T: Send>(
         &self,
         pairs: &[Pair],
-        codebook: Option<&Codebook>,
+        read: impl Fn(ImageId, CameraId) -> I + Sync,
         mut known: impl FnMut(&[Pair]) -> Result<Option<Vec<(Pair, T)>>, PipelineError>,
-        work: impl Fn(Pair, (&Selected, &Selected)) -> T + Sync,
+        work: impl Fn(Pair, (&I, &I)) -> T + Sync,
         keep: impl Fn(&[Pair], &[(Pair, T)]) -> Result<(), PipelineError>,
     ) -> Result<Vec<(Pair, T)>, PipelineError> {
         let cameras = self.intake.camera_of_image();
@@ -268,7 +282,7 @@ impl Matcher<'_> {
         for &(a, b) in pairs {
             tiles.entry((a.0 / TILE_IMAGES, b.0 / TILE_IMAGES)).or_default().push((a, b));
         }
-        let mut images: BTreeMap<ImageId, Selected> = BTreeMap::new();
+        let mut images: BTreeMap<ImageId, I> = BTreeMap::new();
         let mut results = Vec::with_capacity(pairs.len());
         for unit in tiles.values().flat_map(|tile| tile.chunks(UNIT_PAIRS)) {
             if self.context.cancel.is_cancelled() {
@@ -283,8 +297,8 @@ impl Matcher<'_> {
             let same_tile = |id: &ImageId| needed.iter().any(|other| other.0 / TILE_IMAGES == id.0 / TILE_IMAGES);
             images.retain(|id, _| same_tile(id));
             let missing: Vec<ImageId> = needed.into_iter().filter(|id| !images.contains_key(id)).collect();
-            let read = missing.into_par_iter().map(|id| (id, self.select(id, cameras[&id], codebook)));
-            images.extend(read.collect::<Vec<_>>());
+            let found = missing.into_par_iter().map(|id| (id, read(id, cameras[&id])));
+            images.extend(found.collect::<Vec<_>>());
             let of_unit = unit.par_iter().filter_map(|&(a, b)| {
                 let done = (!self.context.cancel.is_cancelled()).then(|| work((a, b), (&images[&a], &images[&b])));
                 Some(((a, b), done?))
@@ -302,7 +316,7 @@ impl Matcher<'_> {
     fn verify_moved(
         &self,
         pair: Pair,
-        images: (&Selected, &Selected),
+        images: (&Positions, &Positions),
         matches: &[(KeypointIdx, KeypointIdx)],
     ) -> Found {
         let num_matches = matches.len() as u32;
@@ -319,10 +333,10 @@ impl Matcher<'_> {
     /// The matches that moved; none where none to speak of stand still, or where the pictures differ in size.
     fn moved(
         &self,
-        (in_a, in_b): (&Selected, &Selected),
+        (in_a, in_b): (&Positions, &Positions),
         matches: &[(KeypointIdx, KeypointIdx)],
     ) -> Option<Vec<(KeypointIdx, KeypointIdx)>> {
-        let camera = |image: &Selected| &self.intake.cameras[&image.camera];
+        let camera = |image: &Positions| &self.intake.cameras[&image.camera];
         if !camera(in_a).has_size_of(camera(in_b)) {
             return None;
         }
@@ -334,7 +348,7 @@ impl Matcher<'_> {
     fn verify(
         &self,
         (a, b): Pair,
-        (in_a, in_b): (&Selected, &Selected),
+        (in_a, in_b): (&Positions, &Positions),
         matches: &[(KeypointIdx, KeypointIdx)],
         cameras: &BTreeMap<CameraId, Camera>,
     ) -> Option<TwoViewGeometry> {
@@ -360,8 +374,9 @@ impl Matcher<'_> {
         let graph = &mut result.graph;
         let pending: Vec<Pair> = graph.pairs.keys().filter(|(a, b)| !(trusted(a) && trusted(b))).copied().collect();
         let again =
-            |pair, images: (&Selected, &Selected)| self.verify(pair, images, &graph.pairs[&pair].inliers, &cameras);
-        let verified = self.for_pairs(&pending, None, |_| Ok(None), again, |_, _| Ok(()))?;
+            |pair, images: (&Positions, &Positions)| self.verify(pair, images, &graph.pairs[&pair].inliers, &cameras);
+        let positions = |id, camera| Positions::new(&self.selected(id), camera);
+        let verified = self.for_pairs(&pending, positions, |_| Ok(None), again, |_, _| Ok(()))?;
         for (pair, geometry) in verified {
             let Some(mut geometry) = geometry else { continue };
             let before = graph.pairs.remove(&pair).map(|before| before.inliers).unwrap_or_default();

@@ -1,60 +1,15 @@
 //! Rows and queries by the cells of a partition of descriptor space, for scans that compare only within cells.
 //!
 //! The rows of a cell are groups of their own ([`CellRows`]), so a cell is scanned as a whole set is; the queries that visit
-//! it are a list of ranks ([`CellLists`]), read where they stand: a block of a few is prepared once for all rows of a cell.
+//! it are a list of their ranks, read where they stand: a block of a few is prepared once for all rows of a cell.
 
 use std::ops::Range;
 
 use super::Top2;
 use super::packed::{GROUP_ROWS, PackedDescriptors};
 use super::tier::Tier;
+use crate::math::Grouped;
 use crate::scene::Descriptor;
-
-/// For every cell the ranks of some descriptors, ascending.
-#[derive(Clone, Debug, Default)]
-pub struct CellLists {
-    ranks: Vec<u32>,
-    /// Where each cell's begin, and the end of the last.
-    starts: Vec<u32>,
-}
-
-impl CellLists {
-    /// Of `num_cells` cells, from cells and ranks in them, by ascending rank.
-    ///
-    /// # Panics
-    /// When a cell is out of range.
-    pub fn new(num_cells: usize, entries: impl Iterator<Item = (u32, u32)> + Clone) -> Self {
-        let mut starts = vec![0u32; num_cells + 1];
-        for (cell, _) in entries.clone() {
-            starts[cell as usize + 1] += 1;
-        }
-        for cell in 0..num_cells {
-            starts[cell + 1] += starts[cell];
-        }
-        let mut ends = starts.clone();
-        let mut ranks = vec![0; starts[num_cells] as usize];
-        for (cell, rank) in entries {
-            let end = &mut ends[cell as usize];
-            ranks[*end as usize] = rank;
-            *end += 1;
-        }
-        Self { ranks, starts }
-    }
-
-    /// The ranks in a cell.
-    ///
-    /// # Panics
-    /// When the cell is out of range.
-    pub fn of(&self, cell: u32) -> &[u32] {
-        let cell = cell as usize;
-        &self.ranks[self.starts[cell] as usize..self.starts[cell + 1] as usize]
-    }
-
-    /// Number of cells.
-    pub fn num_cells(&self) -> usize {
-        self.starts.len().saturating_sub(1)
-    }
-}
 
 /// Rows by cell, each cell's in groups of sixteen slots of which the last ones may be empty.
 #[derive(Clone, Debug, Default)]
@@ -71,11 +26,11 @@ impl CellRows {
     ///
     /// # Panics
     /// When a rank is out of range.
-    pub fn pack(descriptors: &[Descriptor], lists: &CellLists) -> Self {
+    pub fn pack(descriptors: &[Descriptor], lists: &Grouped<u32>) -> Self {
         let mut rows = Self { starts: vec![0], ..Self::default() };
-        rows.packed.reserve_groups(lists.ranks.len().div_ceil(GROUP_ROWS) + lists.num_cells());
-        for cell in 0..lists.num_cells() as u32 {
-            let of_cell = lists.of(cell);
+        rows.packed.reserve_groups(lists.num_items().div_ceil(GROUP_ROWS) + lists.num_groups());
+        for cell in 0..lists.num_groups() {
+            let of_cell = lists.group(cell);
             rows.packed.append_subset(descriptors, of_cell);
             rows.ranks.extend(of_cell);
             let groups = rows.packed.num_groups();
@@ -115,8 +70,7 @@ impl CellRows {
     }
 
     /// The groups of a cell.
-    pub(super) fn groups_of(&self, cell: u32) -> Range<usize> {
-        let cell = cell as usize;
+    pub(super) fn groups_of(&self, cell: usize) -> Range<usize> {
         self.starts[cell] as usize..self.starts[cell + 1] as usize
     }
 }
@@ -129,11 +83,11 @@ impl CellRows {
 /// When `visitors` and `rows` have different numbers of cells, or a visitor's rank is out of range.
 pub fn top2_in_cells(
     queries: &[Descriptor],
-    visitors: &CellLists,
+    visitors: &Grouped<u32>,
     rows: &CellRows,
     of_queries: &mut Vec<Option<Top2>>,
     of_slots: &mut Vec<Option<Top2>>,
 ) {
-    assert_eq!(visitors.num_cells(), rows.num_cells(), "cells of different partitions");
+    assert_eq!(visitors.num_groups(), rows.num_cells(), "cells of different partitions");
     Tier::detected().top2_in_cells(queries, visitors, rows, of_queries, of_slots);
 }

@@ -9,8 +9,9 @@
 //! distances, and the final reduction takes the lowest index among equal lanes.
 
 use super::Top2;
-use super::cells::{CellLists, CellRows};
+use super::cells::CellRows;
 use super::packed::{GROUP_ROWS, Group, PADDING_BIAS, PackedDescriptors, fetch_early, norm_sq};
+use crate::math::Grouped;
 use crate::scene::{DESCRIPTOR_LEN, Descriptor};
 
 /// Groups in a chunk: 64 * 2 KiB = 128 KiB of rows.
@@ -172,7 +173,7 @@ pub(super) unsafe fn distances_sq<K: Kernel, const Q: usize>(
 #[inline(always)]
 pub(super) unsafe fn top2_in_cells<K: Kernel, const Q: usize, const G: usize>(
     queries: &[Descriptor],
-    visitors: &CellLists,
+    visitors: &Grouped<u32>,
     rows: &CellRows,
     of_queries: &mut Vec<Option<Top2>>,
     of_slots: &mut Vec<Option<Top2>>,
@@ -181,8 +182,8 @@ pub(super) unsafe fn top2_in_cells<K: Kernel, const Q: usize, const G: usize>(
     let mut states = RowStates::new(packed.num_groups());
     of_queries.clear();
     of_queries.resize(queries.len(), None);
-    for cell in 0..rows.num_cells() as u32 {
-        let (visiting, groups) = (visitors.of(cell), rows.groups_of(cell));
+    for cell in 0..rows.num_cells() {
+        let (visiting, groups) = (visitors.group(cell), rows.groups_of(cell));
         for chunk in groups.clone().step_by(CHUNK_GROUPS) {
             let chunk_end = (chunk + CHUNK_GROUPS).min(groups.end);
             for first in (0..visiting.len()).step_by(Q) {
@@ -203,8 +204,8 @@ pub(super) unsafe fn top2_in_cells<K: Kernel, const Q: usize, const G: usize>(
         }
     }
     of_slots.clear();
-    for cell in 0..rows.num_cells() as u32 {
-        let (visiting, groups) = (visitors.of(cell), rows.groups_of(cell));
+    for cell in 0..rows.num_cells() {
+        let (visiting, groups) = (visitors.group(cell), rows.groups_of(cell));
         let slots = groups.start * GROUP_ROWS..groups.end * GROUP_ROWS;
         of_slots.extend(
             slots.map(|slot| states.of(slot).map(|found| Top2 { index: visiting[found.index as usize], ..found })),
@@ -225,7 +226,7 @@ pub(super) unsafe fn top2_of_cells<K: Kernel, const G: usize>(
     let (prepared, norms_sq) = block::<K, 1>(1, |_| query);
     let mut nearest: Option<Top2> = None;
     for &cell in cells {
-        let groups = rows.groups_of(cell);
+        let groups = rows.groups_of(cell as usize);
         if !groups.is_empty() {
             // SAFETY: passed on to the caller.
             let [found] = unsafe { scan_block::<K, 1, G>(&prepared, &norms_sq, 0, &rows.packed, groups, None) };

@@ -35,7 +35,7 @@ mod tier;
 mod x86;
 
 pub use banded::{BandQuery, BandTop2, BandedRows, NearestQueries, nearest_off_bands, top2_in_bands};
-pub use cells::{CellLists, CellRows, top2_in_cells};
+pub use cells::{CellRows, top2_in_cells};
 pub use packed::PackedDescriptors;
 pub use tier::Tier;
 

@@ -1,5 +1,5 @@
 use super::*;
-use crate::math::Rng;
+use crate::math::{Grouped, Rng};
 use crate::scene::DESCRIPTOR_LEN;
 
 /// Half of the bytes full-range at random, sometimes all 0 or all 255, and now and then a repeat, so that ties occur.
@@ -236,8 +236,8 @@ fn every_tier_agrees_within_cells() {
         let (queries, rows) = (descriptors(&mut rng, num_queries), descriptors(&mut rng, num_rows));
         let visits = cells_of(&mut rng, num_queries, num_cells);
         let own: Vec<(u32, u32)> = (0..num_rows as u32).map(|row| (rng.below(num_cells) as u32, row)).collect();
-        let visitors = CellLists::new(num_cells, visits.iter().copied());
-        let celled = CellRows::pack(&rows, &CellLists::new(num_cells, own.iter().copied()));
+        let visitors = Grouped::new(num_cells, visits.iter().copied());
+        let celled = CellRows::pack(&rows, &Grouped::new(num_cells, own.iter().copied()));
         // By definition: best and second of what shares a cell.
         let nearest = |query: &Descriptor, cells: &[u32]| {
             let seen = own.iter().filter(|(cell, _)| cells.contains(cell)).map(|&(_, row)| row);
@@ -267,7 +267,7 @@ fn every_tier_agrees_within_cells() {
             });
             for (slot, cell, row) in slots {
                 let mut asked: Vec<(u32, u32)> = visitors
-                    .of(cell)
+                    .group(cell as usize)
                     .iter()
                     .map(|&query| (distance_sq(&queries[query as usize], &rows[row as usize]), query))
                     .collect();

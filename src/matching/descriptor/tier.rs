@@ -4,9 +4,10 @@ use std::ops::Range;
 use std::sync::LazyLock;
 
 use super::banded::{self, BandQuery, BandTop2, BandedRows, NearestQueries};
-use super::cells::{CellLists, CellRows};
+use super::cells::CellRows;
 use super::scalar::{self, Scalar};
 use super::{PackedDescriptors, Top2, kernel};
+use crate::math::Grouped;
 use crate::scene::Descriptor;
 
 /// A set of instructions a kernel is written for. All give identical results.
@@ -147,7 +148,7 @@ impl Tier {
     pub fn top2_in_cells(
         self,
         queries: &[Descriptor],
-        visitors: &CellLists,
+        visitors: &Grouped<u32>,
         rows: &CellRows,
         of_queries: &mut Vec<Option<Top2>>,
         of_slots: &mut Vec<Option<Top2>>,
@@ -279,9 +280,10 @@ mod x86 {
     use std::ops::Range;
 
     use super::super::banded::{self, BandQuery, BandTop2, BandedRows, NearestQueries};
-    use super::super::cells::{CellLists, CellRows};
+    use super::super::cells::CellRows;
     use super::super::x86::{Avx2, Avx512Vnni, AvxVnni};
     use super::super::{PackedDescriptors, Top2, kernel, scalar};
+    use crate::math::Grouped;
     use crate::scene::Descriptor;
 
     macro_rules! compile {
@@ -326,7 +328,7 @@ mod x86 {
             #[target_feature(enable = $features)]
             pub(super) fn $in_cells(
                 queries: &[Descriptor],
-                visitors: &CellLists,
+                visitors: &Grouped<u32>,
                 rows: &CellRows,
                 of_queries: &mut Vec<Option<Top2>>,
                 of_slots: &mut Vec<Option<Top2>>,
